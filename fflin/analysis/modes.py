@@ -18,7 +18,7 @@ from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.coordinates import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.equipment.appendage_bodies import effective_shares
+from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:

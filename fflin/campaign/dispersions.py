@@ -25,13 +25,13 @@ from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
-from fflin.robot.equipment.appendage_bodies import first_impossible
+from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
+from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
-from fflin.simulation.times import Times
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}

@@ -231,7 +231,7 @@ class Funnel(Design):
         if x is None and q is None:
             raise InputError("no state is given; give x, or q and v")
         q, v = point_of(state, x, q, v, lambda: (q, v))
-        e = moving_error(state, *self.trajectory.flow.at(float(t))[:2], q, v)
+        e = moving_error(state, *self.trajectory.point(t)[:2], q, v)
         return bool(e @ self.cost(t) @ e <= rho)
 
     def __repr__(self) -> str:

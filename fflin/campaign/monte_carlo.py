@@ -44,7 +44,7 @@ from fflin.simulation.report import pushed
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
-    *("duration", "events", "callback", "linear", "every", "progress")
+    *("robot", "policy", "duration", "events", "callback", "linear", "every", "progress", "engine")
 }
 
 

@@ -37,8 +37,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
-from fflin.simulation.plan import Event, Plan, SimulationOptions, law_of, planned
-from fflin.simulation.plant import Plant, conserved_by
+from fflin.simulation.plan import Event, Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of
 
@@ -68,11 +67,14 @@ class CampaignJob:
         # A judge compares errors with the errors at the start, so the histories contain the start.
         histories = options.pop("histories", 0 if judge is None else 1)
         unlimited = options.pop("unlimited", False)
-        options = SimulationOptions(linear=False, progress=False, **options)
-        self.plan, self.plant = planned(robot, policy, options)
+        options = SimulationOptions(
+            robot=robot, policy=policy, linear=False, progress=False, **options
+        )
+        self.plan = Plan(options)
+        self.plant = self.plan.plant
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
-            self.plan = replace(self.plan, limits=Saturation(-most, most))
+            self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.engine, state, times = engine, self.plant.state, self.plan.times
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx).
@@ -106,7 +108,7 @@ class CampaignJob:
 
     def choose(self, engine: object) -> None:
         """Set the engine of the runs to the requested or the fastest one that supports the plan."""
-        self.engine = engine_of(engine, self.plan, self.plant, many=True)
+        self.engine = engine_of(engine, self.plan, many=True)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -141,9 +143,7 @@ class CampaignJob:
         if self.engine == "python":
             return content_digest(self.run(first, 0).arrays)
         runs = self._in_lanes(first.drawn)
-        return content_digest(
-            {**_loop_arrays(self.plan, self.plant), **runs, "target": self.target}
-        )
+        return content_digest({**_loop_arrays(self.plan), **runs, "target": self.target})
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Simulate runs with the given drawn values."""
@@ -163,7 +163,7 @@ class CampaignJob:
     def _fly(self, drawn: Array, out: Mapping[str, Array]) -> None:
         """Simulate runs (N, k) in compiled code, eight at a time."""
         runs = self._in_lanes(drawn)
-        loop = LaneLoop(self.plan, self.plant, runs)
+        loop = LaneLoop(self.plan, runs)
         state, path = self.plant.state, self._path
         over = self.judge.over if self.judge else None
         statistics = RunStatistics(self.plan, state, self.target, self.steps, path, over)
@@ -179,19 +179,19 @@ class CampaignJob:
         assert tree is not None
         return self.dispersions.in_lanes(drawn, tree)
 
-    def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
-        """Return the plan of a run (k,), and its plant."""
+    def plan_of(self, drawn: Array) -> Plan:
+        """Return the plan of a run (k,)."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
         times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
-        return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
+        return plan.replace(plant=plant, q=q, v=v, policy=policy, law=law, times=times)
 
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
     def _one(self, drawn: Array) -> dict[str, Array]:
-        plan, plant = self.plan_of(drawn)
+        plan = self.plan_of(drawn)
         if over := self.judge and self.judge.over:
-            plan = replace(plan, events=(self._event(over, plan),))
-        run = _recorded(plan, plant, every=1)
+            plan = plan.replace(events=(self._event(over, plan),))
+        run = _recorded(plan, every=1)
         return outcome_of(plan, self.plant.state, self.target, self.steps, run)
 
     def _event(self, over: Over, plan: Plan) -> Event:
@@ -214,7 +214,7 @@ class CampaignJob:
         drawn, steps = first.part(0, self.lanes), plan.times.steps
 
         def measured(steps: int) -> float:
-            few.plan = replace(plan, times=plan.times._replace(steps=steps))
+            few.plan = plan.replace(times=plan.times._replace(steps=steps))
             # Other programs may slow down one of the trials.
             return min(repeat(lambda: few.run(drawn, 0), timer=perf_counter, repeat=3, number=1))
 
@@ -226,30 +226,29 @@ class CampaignJob:
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat a run (k,) with the same arithmetic, and return its motion."""
-        plan, plant = self.plan_of(drawn)
+        plan = self.plan_of(drawn)
         if self.engine == "python":
-            run = _recorded(plan, plant, plan.times.every)
+            run = _recorded(plan, plan.times.every)
         else:
-            run = recorded(self.plan, self.plant, self._in_lanes(drawn[None]))
-        motion = motion_of(plan, plant, conserved_by(plant.robot, plan.q, plant.field), run)
+            run = recorded(self.plan, self._in_lanes(drawn[None]))
+        motion = motion_of(plan, run)
         return replace(motion, _nominal=self.plant.robot.urdf_sha256)
 
 
-def _recorded(plan: Plan, plant: Plant, every: int) -> Recording:
+def _recorded(plan: Plan, every: int) -> Recording:
     """Simulate a run in Python, and record a row every `every` steps."""
-    plan = replace(plan, times=plan.times._replace(every=every))
-    run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
+    run = go(plan.replace(times=plan.times._replace(every=every)))
     if run.stopped.startswith("interrupted"):
         raise KeyboardInterrupt
     return run
 
 
-def _loop_arrays(plan: Plan, plant: Plant) -> dict[str, object]:
+def _loop_arrays(plan: Plan) -> dict[str, object]:
     """Return all arrays and numbers that the compiled loop reads for a plan, without compiling it.
 
     Two plans with equal arrays have equal runs.
     """
-    parts = packed(plan, plant)
+    parts = packed(plan)
     last = min(plan.times.steps, SLOTS * plan.times.sample)
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
     found: dict[str, object] = {"noise": samples}

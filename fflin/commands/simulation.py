@@ -123,7 +123,7 @@ def view(arguments: Namespace) -> Report:
 
 def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
     """Raise an error before the simulation if `pictures` would refuse the options."""
-    from fflin.simulation.times import LONGEST
+    from fflin.simulation.plan import LONGEST
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
@@ -149,7 +149,7 @@ def pictures(
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
     """Return the policy that the arguments define, and the options of `fflin.simulate`."""
-    from fflin.simulation.times import SHORTEST, time_to_settle
+    from fflin.simulation.plan import SHORTEST, time_to_settle
 
     settings: dict[str, Any] = {
         **{name: getattr(arguments, name) for name in ("dt", "method", "delay", "duration")},

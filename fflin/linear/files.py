@@ -1,10 +1,10 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
 A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
-each for the states, inputs and outputs; one for the point in Pinocchio's order; and the table
-``info`` of texts and numbers, whose last line is the digest of all tables. In a trajectory in csv,
-every row of the last column repeats the digest of the other columns. So the file has no extra
-lines, and other programs can read the columns by their names.
+each for the states, inputs and outputs; and the table ``info`` of all other entries, whose last
+line is the digest of all tables. In a trajectory in csv, every row of the last column repeats the
+digest of the other columns. So the file has no extra lines, and other programs can read the
+columns by their names.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.errors import FflinError, FileError, InputError, listed, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
-from fflin.base.validation import as_double, frozen
+from fflin.base.validation import as_double, frozen, vector
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.coordinates import Frame
+from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.state import StateMap
 
 if TYPE_CHECKING:
@@ -56,34 +56,32 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "drift": ("drift",),
     "limits": ("limit",),
 }
-_NAMED = [f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS]
-_LISTS = ("locked", "ignorable", "limit_names")
+_NAMES = [f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS]
+_LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
-_MATRICES = {key: of for key, of in _ARRAYS.items() if len(of) == 2}
-_POINT = [key for key, of in _ARRAYS.items() if len(of) == 1 and of[0] not in _SIGNALS]
-_TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "point", "info")
+_MATRICES = [key for key, of in _ARRAYS.items() if len(of) == 2]
+_TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
 
 T = TypeVar("T")
 
 
 def record_of(lin: LinearModel) -> Record:
     """Return the entries of a file for a model."""
-    special: Record = {
+    entries: Record = {
         "reference": lin.placement,
         "drift": np.zeros(0) if lin.drift is None else lin.drift,
         "limits": np.array(list(lin.limits.values())),
         "limit_names": list(lin.limits),
         "weights": json.dumps(dict(lin.weights)),
+        "certificate": asdict(lin.certificate),
     }
-    entries: Record = {
-        key: special[key] if key in special else getattr(lin, key)
-        for key in (*_ARRAYS, *_NAMED, *_LISTS, *_TEXTS, *_FIGURES)
-    }
-    entries |= {key: list(entries[key]) for key in (*_NAMED, *_LISTS)}
-    entries |= {key: float(entries[key]) for key in _FIGURES}
-    return entries | {"certificate": asdict(lin.certificate)}
+    for key in (*_ARRAYS, *_LISTS, *_TEXTS, *_FIGURES):
+        if key not in entries:
+            value = getattr(lin, key)
+            entries[key] = list(value) if key in _LISTS else value
+    return entries | {key: float(entries[key]) for key in _FIGURES}
 
 
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
@@ -104,43 +102,37 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
     check_ending(path, FORMATS)
     with reading(path, "linear model"):
         entries, verified = _from_csv(path) if path.suffix == ".csv" else read_record(path)
-        fields = _fields(entries)
-        return fields | {"verified": verified}, certificate(**figures(entries["certificate"]))
-
-
-def _fields(entries: Record) -> dict[str, Any]:
-    fields: dict[str, Any] = {key: texts(entries[key]) for key in (*_NAMED, *_LISTS)}
-    fields |= {key: text(entries[key]) for key in _TEXTS}
-    fields |= {key: figure(entries[key]) for key in _FIGURES}
-    if fields["frame"] not in get_args(Frame):
-        raise ValueError(f"unknown frame '{fields['frame']}'")
-    sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
-    units = {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}
-    if sizes != units:
-        raise ValueError("the number of its signals differs from the number of their units")
-    sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
-    sizes |= {"drift": sizes["state"] if np.size(entries["drift"]) else 0}
-    sizes |= {"limit": len(fields["limit_names"])}
-    for key, dimensions in _ARRAYS.items():
-        array = np.array(entries[key], dtype=float)
-        if not np.isfinite(array).all():
-            raise ValueError(f"{key} has entries that are not finite")
-        fields[key] = frozen(array.reshape([sizes[each] for each in dimensions]))
-    weights, drift = json.loads(fields["weights"]), fields.pop("drift")
-    if not isinstance(weights, dict) or not all(
-        isinstance(x, dict | str) for x in weights.values()
-    ):
-        raise ValueError("its weights are not a table")
-    limits = dict(zip(fields.pop("limit_names"), fields.pop("limits").tolist(), strict=True))
-    return fields | {
-        "moving": bool(fields["moving"]),
-        "weights": weights,
-        "_reference": fields.pop("reference"),
-        "_drift": drift if drift.size else None,
-        "_inertia": partial(given, fields.pop("M")),
-        "_ignorable": partial(given, fields.pop("ignorable")),
-        "_limits": partial(dict, limits),
-    }
+        fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
+        fields |= {key: text(entries[key]) for key in _TEXTS}
+        fields |= {key: figure(entries[key]) for key in _FIGURES}
+        if fields["frame"] not in get_args(Frame):
+            raise ValueError(f"unknown frame '{fields['frame']}'")
+        sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
+        if sizes != {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}:
+            raise ValueError("the number of its signals differs from the number of their units")
+        sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
+        sizes["drift"] = sizes["state"] if np.size(entries["drift"]) else 0
+        sizes["limit"] = len(limit_names := fields.pop("limit_names"))
+        for key, dimensions in _ARRAYS.items():
+            array = np.array(entries[key], dtype=float)
+            if not np.isfinite(array).all():
+                raise ValueError(f"{key} has entries that are not finite")
+            fields[key] = frozen(array.reshape([sizes[each] for each in dimensions]))
+        fields["weights"] = weights = json.loads(fields["weights"])
+        if not isinstance(weights, dict) or not all(
+            isinstance(x, dict | str) for x in weights.values()
+        ):
+            raise ValueError("its weights are not a table")
+        drift, limits = fields.pop("drift"), fields.pop("limits").tolist()
+        return fields | {
+            "moving": bool(fields["moving"]),
+            "verified": verified,
+            "_reference": fields.pop("reference"),
+            "_drift": drift if drift.size else None,
+            "_inertia": partial(given, fields.pop("M")),
+            "_ignorable": partial(given, fields.pop("ignorable")),
+            "_limits": partial(dict, dict(zip(limit_names, limits, strict=True))),
+        }, certificate(**figures(entries["certificate"]))
 
 
 def given(value: T, _: object) -> T:
@@ -149,32 +141,31 @@ def given(value: T, _: object) -> T:
 
 
 def _tables(entries: Record) -> dict[str, list[list[object]]]:
+    """Return the tables of a model's csv files as {name of the table: rows}."""
     names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
     names["velocity"] = names["state"][-len(entries["M"]) :]
     tables: dict[str, list[list[object]]] = {}
-    for key, (rows, columns) in _MATRICES.items():
-        body = zip(names[rows], entries[key].tolist(), strict=True)
-        tables[key] = [["", *names[columns]], *([name, *row] for name, row in body)]
     for signal in _SIGNALS:
-        keys = _columns_of(signal)
-        lines = zip(*(np.asarray(entries[key]).tolist() for key in keys), strict=True)
-        tables[f"{signal}s"] = [["name", "unit", *keys[2:]], *map(list, lines)]
-    point = [[f"{key}[{i}]", x] for key in _POINT for i, x in enumerate(entries[key].tolist())]
-    tables["point"] = [["name", "value"], *point]
-    info = {key: entries[key] for key in (*_TEXTS, *_FIGURES)}
-    info |= {key: ";".join(entries[key]) for key in _LISTS}
+        vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
+        keys = (f"{signal}_names", f"{signal}_units", *vectors)
+        rows = zip(*(np.asarray(entries[key]).tolist() for key in keys), strict=True)
+        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, rows)]
+    info: dict[str, object] = {key: entries[key] for key in (*_TEXTS, *_FIGURES)}
+    info |= {key: ";".join(entries[key]) for key in ("locked", "ignorable", "limit_names")}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
+    for key, of in _ARRAYS.items():
+        values = entries[key].tolist()
+        if len(of) == 2:
+            body = zip(names[of[0]], values, strict=True)
+            tables[key] = [["", *names[of[1]]], *([name, *row] for name, row in body)]
+        elif of[0] not in _SIGNALS:
+            info |= {f"{key}[{i}]": value for i, value in enumerate(values)}
     tables["info"] = [["name", "value"], *map(list, info.items())]
-    return tables
-
-
-def _columns_of(signal: str) -> list[str]:
-    """Return the entries of a model that form the columns of a signal's table."""
-    vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
-    return [f"{signal}_names", f"{signal}_units", *vectors]
+    return {key: tables[key] for key in _TABLES}
 
 
 def _from_csv(path: Path) -> tuple[Record, bool]:
+    """Return the entries of a model in csv, and whether their digest was verified."""
     if not _csv_path(path, "info").exists() and path.exists():
         raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
     contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
@@ -185,23 +176,28 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )
-    tables = {
-        key: list(csv.reader(io.StringIO(content.decode(), newline="")))[1:]
-        for key, content in contents.items()
-    }
-    entries: Record = {key: [row[1:] for row in tables[key]] for key in _MATRICES}
-    for signal in _SIGNALS:
-        keys = _columns_of(signal)
-        columns = list(zip(*tables[f"{signal}s"], strict=True)) or [()] * len(keys)
-        entries |= zip(keys, columns, strict=True)
-    for key in _POINT:
-        entries[key] = [x for name, x in tables["point"] if name.startswith(f"{key}[")]
-    info, prefix = dict(tables["info"]), "certificate."
-    entries |= {key: info[key] for key in (*_TEXTS, *_FIGURES)}
-    entries |= {key: [each for each in info[key].split(";") if each] for key in _LISTS}
-    entries["certificate"] = {
-        key.removeprefix(prefix): x for key, x in info.items() if key.startswith(prefix)
-    }
+    entries: Record = {key: [] for key in _ARRAYS} | {"certificate": {}}
+    for key, content in contents.items():
+        header, *rows = list(csv.reader(io.StringIO(content.decode(), newline=""))) or [[]]
+        if key in _MATRICES:
+            entries[key] = [row[1:] for row in rows]
+            continue
+        if key != "info":
+            columns = list(zip(*rows, strict=True)) or [()] * len(header)
+            of = (f"{key[:-1]}_names", f"{key[:-1]}_units", *header[2:])
+            entries |= zip(of, columns, strict=False)
+            continue
+        for name, value in rows:
+            of_array, bracket, _ = name.partition("[")
+            _, dot, of_certificate = name.partition(".")
+            if bracket:
+                entries[of_array].append(value)
+            elif dot:
+                entries["certificate"][of_certificate] = value
+            elif name in _LISTS:
+                entries[name] = [each for each in value.split(";") if each]
+            else:
+                entries[name] = value
     return entries, bool(mark)
 
 
@@ -223,10 +219,11 @@ def write_csv(path: Path, traj: Trajectory) -> None:
     names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
     table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
+    content = csv_table(table)
     if traj.verified:
-        checksum = _digest(table)
-        table = [[*names, record.CHECKSUM], *([*row, checksum] for row in table[1:])]
-    write_atomically({path: csv_table(table)})
+        digest = record.content_digest({"table": content})
+        content = csv_table([[*names, record.CHECKSUM], *([*row, digest] for row in table[1:])])
+    write_atomically({path: content})
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
@@ -249,7 +246,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
     try:
-        entries = _entries(entries, StateMap(robot)) if table else entries
+        entries = _entries(entries, robot) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
         frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
         return arguments(entries, robot, hold, frame, verified)
@@ -258,7 +255,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
 
 
 def arguments(
-    entries: Record, robot: Robot, hold: str | None, frame: Any, verified: bool
+    entries: Record, robot: Robot, hold: str | None, frame: str, verified: bool
 ) -> dict[str, Any]:
     """Return the arguments of `Trajectory` from named entries: t, u, and q, v or x."""
     states = "q" in entries and "v" in entries
@@ -268,12 +265,18 @@ def arguments(
             f"the file has the entries {found}; expected t, u, and either x or both q and v"
         )
     reference = pin.XYZQUATToSE3(np.ravel(entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0])))
-    state = StateMap(robot, reference=reference, frame=frame)
-    u = as_double("u", entries["u"])
+    state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
+    actuation, u = Actuation(state), as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u
-    if "input_names" in entries or u.shape[-1] != len(Actuation(state).names):
-        _require_inputs(Actuation(state).names, entries.get("input_names", []), u.shape[-1])
-    for columns in Actuation(state).held:
+    names, there = actuation.names, texts(entries.get("input_names", actuation.names))
+    if names != there or u.shape[-1] != len(names):
+        extra = [name for name in there if name not in names]
+        raise InputError(
+            f"the file has {u.shape[-1]} inputs{f', such as {extra[0]}' if extra else ''}, "
+            f"expected one for each input of the robot: {listed(names)}; load the robot with the "
+            "inputs of the trajectory (--inputs)"
+        )
+    for columns in actuation.held:
         # Inputs in reference axes are rotated to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
     found_as: dict[str, object] = {"t": np.ravel(entries["t"]), "u": u}
@@ -285,28 +288,8 @@ def arguments(
         raise InputError(
             f"x has shape {x.shape}, expected (N, {state.nx}): a row of states for each knot"
         )
-    q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
+    _, q, v = state.points(x)
     return found_as | {"q": q, "v": v}
-
-
-def _require_inputs(known: Sequence[str], names: object, count: int) -> None:
-    """Raise `InputError` if the names or the number of a file's inputs differ from the robot's."""
-    given = texts(names)
-    if given == tuple(known):
-        return
-    missing, extra = ([n for n in a if n not in b] for a, b in ((known, given), (given, known)))
-    said = "the file contains the inputs of the robot in another order"
-    if not given:
-        said = f"u has {count} columns, expected one for each input of the robot: {listed(known)}"
-    elif missing or extra:
-        parts = (("lacks the inputs", missing), ("has the other inputs", extra))
-        said = "the file " + " and ".join(f"{what} {listed(n)}" for what, n in parts if n)
-    raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
-
-
-def _digest(table: Sequence[Sequence[object]]) -> str:
-    """Return the digest of a table without its column of digests."""
-    return record.content_digest({"table": csv_table(table)})
 
 
 def _columns(path: Path) -> tuple[Record, bool]:
@@ -320,33 +303,29 @@ def _columns(path: Path) -> tuple[Record, bool]:
             raise ValueError(f"row {number} has {len(row)} cells, the header has {len(header)}")
     checksummed = header[-1] == record.CHECKSUM
     if checksummed:
-        *header, _ = header
-        found, rows = {row[-1] for row in rows}, [row[:-1] for row in rows]
-        if found != {_digest([header, *rows])}:
+        _, *digests = [line.pop() for line in (header, *rows)]
+        if {*digests} != {record.content_digest({"table": csv_table([header, *rows])})}:
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete the column {record.CHECKSUM}"
             )
     return dict(zip(header, zip(*rows, strict=True), strict=True)), checksummed
 
 
-def _entries(columns: Record, state: StateMap) -> Record:
+def _entries(columns: Record, robot: Robot) -> Record:
     """Convert the named columns of a csv to the entries of a trajectory."""
     if "t [s]" in columns:
         raise FileError(
             "this table contains a motion, expected a trajectory; save motion.trajectory() in "
             "its place, or save the motion as .npz, .mat or .json"
         )
+    state = StateMap(robot)
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
     rows = rows if any(rows.values()) else {"x": list(state.names)}
     rows["t"] = ["t"]
     known = [name for names in rows.values() for name in names]
-    for name in known:
-        if name not in columns:
-            raise unknown("column", name, columns)
-    for name in columns:
-        if name not in {*known, *inputs, "hold", "frame"}:
-            raise unknown("state or input", name, (*known, *inputs))
+    require_known("column", known, columns)
+    require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
     # The last row of inputs may be empty: inputs that are constant between knots have no value
@@ -365,9 +344,4 @@ def _numbers(name: str, cells: tuple[str, ...]) -> Array:
         values = np.array(cells, dtype=float)
     except ValueError as error:
         raise InputError(f"column {name}: {error}; expected numbers") from None
-    if not np.isfinite(values).all():
-        row = int(np.argmin(np.isfinite(values)))
-        raise InputError(
-            f"row {row + 2} of column {name} is '{cells[row]}', expected a finite number"
-        )
-    return values
+    return vector(f"column {name}", values, len(cells), "one for each row")

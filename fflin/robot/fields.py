@@ -174,14 +174,6 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, Any]:
     return state
 
 
-def of_joints(state: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
-    """Return a point, start or target with only the entries of `joints`."""
-    names = {*joints, *state_keys(joints)}
-    by_name = {part: state[part] for part in ("joints", "velocity") if part in state}
-    kept = {part: {k: x for k, x in of.items() if k in names} for part, of in by_name.items()}
-    return {**state, **kept}
-
-
 def _weights(value: object, robot: Robot) -> dict[str, Any]:
     """Check the weights of a robot's regulator; the keys are names of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)

@@ -15,8 +15,7 @@ from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
-from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.links import is_impossible
+from fflin.robot.urdf.description import Mimic, is_impossible
 from fflin.robot.urdf.reader import Advice, read_urdf
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
@@ -115,27 +114,31 @@ def _load(
     found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
 ) -> tuple[Robot, tuple[Advice, ...]]:
     """Return the robot of a URDF, and warnings that fields of the robot can resolve."""
-    description = read_urdf(found.path)
-    loaded = _robot(description.model, found.name, lock, description.mimics)
+    urdf = read_urdf(found.path)
+    loaded = _robot(urdf.model, found.name, lock, urdf.mimics)
     dirs = (*package_dirs, *found.package_dirs)
     # Meshes are read only when the robot is drawn, so output files must not overwrite them.
-    remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in description.meshes)))
-    damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
+    remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
+    damping = {name: urdf.joints[name].damping for name in loaded.joint_names}
     # Damping of a mimic joint is added to its leader so that the dissipated power remains the
     # same.
     for joint, leader, multiplier, _ in loaded.followers:
-        damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
+        damping[leader.name] += multiplier**2 * urdf.joints[joint.name].damping
     loaded = replace(
         loaded,
         urdf=found.path,
-        urdf_sha256=description.sha256,
-        notes=description.notes,
+        urdf_sha256=urdf.sha256,
+        notes=urdf.notes,
         package_dirs=dirs,
         urdf_damping=damping,
-        links={name: LinkMass.of(link) for name, link in description.links.items()},
-        file_joints=description.joints,
+        links={
+            name: LinkMass(link.mass, link.tensor, link.com.placement)
+            for name, link in urdf.links.items()
+            if link.mass
+        },
+        file_joints=tuple(urdf.joints),
     )
-    return loaded, description.advice
+    return loaded, urdf.advice
 
 
 def from_model(

@@ -21,7 +21,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array, number, positive, shaped, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.urdf.links import TRIANGLE_SLACK, Link, is_impossible
+from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -145,19 +145,6 @@ class LinkMass(NamedTuple):
     mass: float
     inertia: Array
     placement: pin.SE3  # placement of the <inertial> on the link
-
-    @classmethod
-    def of(cls, link: Link) -> LinkMass:
-        """Return the mass properties of a <link>."""
-        xx, xy, xz, yy, yz, zz = link.inertia
-        turn = link.com.quaternion
-        rotation = (
-            pin.rpy.rpyToMatrix(*link.com.rpy)
-            if turn is None
-            else pin.Quaternion(np.array(turn)).matrix()
-        )
-        inertia = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-        return cls(float(link.mass or 0.0), inertia, pin.SE3(rotation, np.array(link.com.xyz)))
 
 
 class Piece(NamedTuple):

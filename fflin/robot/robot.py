@@ -15,8 +15,8 @@ import pinocchio as pin
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
-from fflin.robot.equipment.assembly import with_appendages, with_inputs
-from fflin.robot.equipment.mounting import difference, stored_momentum
+from fflin.robot.equipment.assembly import equipped, with_appendages
+from fflin.robot.equipment.mounting import stored_momentum
 from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
@@ -251,7 +251,7 @@ class Robot(Coordinates):
         if "passive" in fields:
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
-            robot = with_inputs(robot, fields.pop("inputs"))
+            robot = equipped(robot, inputs=fields.pop("inputs"))
         if "appendages" in fields:
             robot = with_appendages(robot, fields.pop("appendages"))
         checked = checked_fields(fields, robot)
@@ -352,16 +352,15 @@ class Robot(Coordinates):
         other = replace(bare, model=model, urdf_sha256=digest)
         if bare is self:
             return other
-        whole = replace(self, urdf_sha256=digest, _unequipped=other)
-        changed: Robot = with_inputs(whole, self.inputs)
+        changed: Robot = equipped(self, other)
         if not self.modes:
             return changed
         # The joints remain the same, so configurations keep their modal amplitudes.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
-            mounted = difference(bare.model.inertias[joint], own[at])
-            model.inertias[at] = difference(other.model.inertias[joint], mounted)
+            mounted = bare.model.inertias[joint] - own[at]
+            model.inertias[at] = other.model.inertias[joint] - mounted
             if model.inertias[at].mass <= 0.0:
                 return changed
         return replace(changed, model=model, joints=self.joints, followers=self.followers)

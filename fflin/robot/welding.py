@@ -12,18 +12,16 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
-from fflin.base.names import joints_by_name, stands_for_any
+from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.equipment.assembly import with_inputs
+from fflin.robot.equipment.assembly import equipped
 from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
 from fflin.robot.mass_properties import LinkMass
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
-from fflin.robot.urdf.joints import Mimic
-
-_GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
+from fflin.robot.urdf.description import Mimic
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
@@ -52,33 +50,19 @@ def welded(robot: Robot, lock: Lock) -> Robot:
         else each
         for each in robot.outputs
     ]
-    per_joint = ("urdf_damping", "limits", "weights")
-    kept = [name for name in robot.joint_names if name not in gone]
-    fields = {name: _without(getattr(robot, name), gone, kept) for name in per_joint}
-    whole = replace(
-        robot,
-        **{"model": model, "locked": (*robot.locked, *locked), "_unequipped": None},
+    fields: dict[str, Any] = {
+        "locked": (*robot.locked, *locked),
+        "passive": tuple(name for name in robot.passive if name not in gone),
+        "outputs": tuple(x for x in outputs if getattr(x, "joints", None) != ()),
+    }
+    bare = replace(
+        bare,
+        model=model,
         joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
         followers=tuple(f.within(model) for f in bare.followers if f.joint.name in left),
-        passive=tuple(name for name in robot.passive if name not in gone),
-        outputs=tuple(x for x in outputs if getattr(x, "joints", None) != ()),
         **fields,
     )
-    return with_inputs(whole, inputs)
-
-
-def _without(of: object, gone: Iterable[str], left: Iterable[str]) -> Any:
-    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
-    if not isinstance(of, Mapping):
-        return of
-    removed, others = (
-        [f"{group}.{name}" for group in _GROUPS for name in names] for names in (gone, left)
-    )
-    return {
-        key: _without(value, gone, left)
-        for key, value in of.items()
-        if stands_for_any(key, others) or not stands_for_any(key, removed)
-    }
+    return equipped(replace(robot, **fields), bare, inputs=inputs)
 
 
 def locked_model(
@@ -174,18 +158,16 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
-    whole = replace(
-        robot,
+    bare = replace(
+        bare,
         model=model,
-        _unequipped=None,
-        name=f"{robot.name}+{other.name}",
         urdf_sha256=sha256(identity.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
         followers=tuple(followers),
-        attached=(*robot.attached, (prefix, other)),
-        **both,
+        links=both.pop("links"),
     )
-    return with_inputs(whole, robot.inputs)
+    name, attached = f"{robot.name}+{other.name}", (*robot.attached, (prefix, other))
+    return equipped(replace(robot, name=name, attached=attached, **both), bare)
 
 
 def _require_new_names(robot: Robot, prefix: str) -> None:

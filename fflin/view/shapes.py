@@ -23,9 +23,9 @@ from fflin.robot.catalog import find_mesh
 from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
 from fflin.robot.joints import ROOT, find_frame, find_joint
 from fflin.robot.robot import Robot
-from fflin.robot.urdf.links import read_pose
-from fflin.robot.urdf.reader import expand, first_xacro, read_document
-from fflin.robot.urdf.xml import Element, named, parse
+from fflin.robot.urdf.description import read_pose
+from fflin.robot.urdf.reader import plain_root, read_document
+from fflin.robot.urdf.xml import Element, named
 
 # Colour of a shape without a colour in the URDF.
 PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
@@ -77,7 +77,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     path = robot.urdf
     assert path is not None
     try:
-        root = _document(path)
+        root, _ = plain_root(read_document(path), path)
     except FflinError as error:
         notes.append(f"no visual geometry: {error}")
         return
@@ -99,7 +99,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
-                placement = at * _placement(visual)
+                placement = at * read_pose(visual).placement
                 color, finish = _material(visual, colors, kind)
             except (ValueError, LookupError):
                 odd.append(str(visual.line))
@@ -129,36 +129,19 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
 
 
-def _document(path: Path) -> Element:
-    document = read_document(path)
-    root = parse(document, str(path))
-    first = first_xacro(root)
-    if path.suffix == ".xacro" or first:
-        root = parse(expand(path, document, first)[0], str(path))
-    return root
-
-
 def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
     (geometry,) = visual.find_all("geometry")
     (shape,) = geometry.children
-    of = f"<{shape.tag}>"
     if shape.tag == "box":
-        return "box", shape.vector("size", of, 3), None
+        return "box", shape.vector("size", 3), None
     if shape.tag == "sphere":
-        return "sphere", (shape.number("radius", of),), None
+        return "sphere", (shape.number("radius"),), None
     if shape.tag in ("cylinder", "capsule"):
-        return shape.tag, (shape.number("radius", of), shape.number("length", of)), None
+        return shape.tag, (shape.number("radius"), shape.number("length")), None
     if shape.tag == "mesh":
-        scale = shape.vector("scale", of, 3) if "scale" in shape.attributes else (1.0, 1.0, 1.0)
-        return "mesh", scale, shape.text("filename", of)
+        scale = shape.vector("scale", 3) if "scale" in shape.attributes else (1.0, 1.0, 1.0)
+        return "mesh", scale, shape.text("filename")
     raise ValueError(shape.tag)
-
-
-def _placement(visual: Element) -> pin.SE3:
-    pose = read_pose(visual, "<visual>")
-    if pose.quaternion is not None:
-        return pin.XYZQUATToSE3(np.array([*pose.xyz, *pose.quaternion]))
-    return pin.SE3(pin.rpy.rpyToMatrix(*pose.rpy), np.array(pose.xyz))
 
 
 def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
@@ -174,7 +157,7 @@ def _color(material: Element) -> Color | None:
     found = material.find_all("color")
     if not found:
         return None
-    r, g, b, a = (min(max(x, 0.0), 1.0) for x in found[0].vector("rgba", "<color>", 4))
+    r, g, b, a = (min(max(x, 0.0), 1.0) for x in found[0].vector("rgba", 4))
     return r, g, b, a
 
 

@@ -30,8 +30,8 @@ def clock(monkeypatch):
         now[0] += len(rows.drawn) * 20.0 * STEP
         return done(job, rows, start, out)
 
-    def stepped(plan, plant, every):
-        found = flown(plan, plant, every)
+    def stepped(plan, every):
+        found = flown(plan, every)
         now[0] += found.steps * STEP  # a run may end early
         return found
 

@@ -107,6 +107,13 @@ def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     with pytest.raises(fflin.UnknownNameError, match="did you mean omega_b"):
         fflin.funnel(still[0], schedule, {"attitude": 1.0}, within={"omega": 1e-4}, knots=2)
     assert (kept.rho < wide.rho).all() and OUTCOME["beyond"] in kept.outcomes
+    # The errors of a start count, not only the errors at the end.
+    goal = {"attitude": 1.0}
+    free, bound = (
+        fflin.funnel(still[0], schedule, goal, within=within, knots=2, samples=40, dt=0.1)
+        for within in (None, goal)
+    )
+    assert bound.rho[0] < free.rho[0] and OUTCOME["beyond"] not in free.outcomes
     # No motion of its own keeps an arm to a goal that it never comes near.
     weak = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, limits=1e-12, samples=8)
     strong = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, samples=8)

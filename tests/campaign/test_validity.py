@@ -22,9 +22,8 @@ import fflin
 from fflin.base.intervals import clopper_pearson
 from fflin.batch.run import executor_of
 from fflin.campaign.dispersions import Draws
-from fflin.campaign.settling import Loop, settling_runs
+from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
-from fflin.simulation.plant import Conserved
 from fflin.simulation.run import go
 from tests.support.commands import refused, run
 from tests.support.messages import any_wording, says
@@ -78,9 +77,9 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
     job = settling_runs(loop, False, None, 1.0)
-    plan, plant = job.plan_of(x - lin.x0)
+    plan = job.plan_of(x - lin.x0)
     times = plan.times._replace(dt=0.02, steps=200, every=1)
-    run = go(replace(plan, times=times), plant, Conserved(robot, plan.q))
+    run = go(plan.replace(times=times))
     end = loop.state.to_state(run.q[-1], run.v[-1], near=x)
     data = robot.create_data()
     q, v = loop.state.to_pinocchio(x)
@@ -103,6 +102,20 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
         q, v = pin.integrate(robot.model, q, h * k), v + h * a
     last = loop.state.to_state(q, v, near=x)
     assert end == pytest.approx(last, abs=2e-4)
+
+
+@pytest.mark.parametrize(("angle", "outcome"), [(170.0, "settled"), (179.0, "chart")])
+def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, outcome):
+    lin, gain = held(robots["cubesat"])
+    loop = Loop(robots["cubesat"], lin, gain.K)
+    x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
+    found = settle(
+        lambda fine: settling_runs(loop, False, None, 0.0, fine),
+        lambda runs: np.tile(x - lin.x0, (len(runs), 1)),
+        1,
+        "python",
+    )
+    assert OUTCOMES[int(found["outcome"][0])] == outcome
 
 
 def test_displacements_are_as_large_as_they_say(robots):
@@ -196,7 +209,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
         e = step @ e
     settles = next(k for k, size in enumerate(sizes) if size <= 1e-3 * sizes[0])
     for steps, outcome in ((settles, 1.0), (settles - 1, 0.0)):
-        job.plan = replace(job.plan, times=times._replace(steps=steps))
+        job.plan = job.plan.replace(times=times._replace(steps=steps))
         assert job.run(Draws((x - lin.x0)[None]), 0).arrays["outcome"] == [outcome]
 
 

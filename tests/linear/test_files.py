@@ -75,7 +75,17 @@ def test_csv_names_rows_and_columns(lin, tmp_path):
         head, *rows = csv.reader(file)
     assert tuple(head[1:]) == lin.input_names
     assert tuple(row[0] for row in rows) == lin.state_names
-    assert float(rows[-1][-1]) == lin.B[-1, -1]
+    assert [list(map(float, row[1:])) for row in rows] == lin.B.tolist()
+    with (tmp_path / "m.inputs.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["name", "unit", "u0"]
+    assert tuple(row[1] for row in rows) == lin.input_units
+    assert [float(row[2]) for row in rows] == lin.u0.tolist()
+    with (tmp_path / "m.info.csv").open(newline="") as file:
+        info = dict(csv.reader(file))
+    assert (info["robot"], info["frame"]) == (lin.robot, "world")
+    assert [float(info[f"q[{i}]"]) for i in range(len(lin.q))] == lin.q.tolist()
+    assert float(info["certificate.route_B"]) == lin.certificate.route_B
 
 
 def test_nothing_is_left_behind_where_writing_fails(lin, tmp_path, monkeypatch):
@@ -111,7 +121,7 @@ def test_bad_paths_are_told(lin, tmp_path):
 @pytest.mark.parametrize("content", [b"", b"rubbish", b"{}", b"PK\x03\x04broken"])
 def test_other_files_are_refused(ending, content, tmp_path):
     path = tmp_path / f"m{ending}"
-    for name in ("A", "B", "C", "D", "M", "states", "inputs", "outputs", "point", "info"):
+    for name in ("A", "B", "C", "D", "M", "states", "inputs", "outputs", "info"):
         (tmp_path / f"m.{name}.csv").write_bytes(content)
     path.write_bytes(content)
     with pytest.raises(fflin.FileError, match="linear model"):

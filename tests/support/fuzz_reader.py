@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from fflin.base.errors import FflinError
-from fflin.robot.urdf.reader import Description, describe
+from fflin.robot.urdf.reader import Urdf, describe
 from tests.support.reader_corpus import CASES, REFUSE
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -83,7 +83,7 @@ def main(count: int, seed: int, folder: Path) -> None:
         path.write_bytes(document)
         begin = time.process_time()
         try:
-            accepted = isinstance(describe(document, path), Description)
+            accepted = isinstance(describe(document, path), Urdf)
         except FflinError as error:
             text = str(error)
             if "\n" in text or not text.startswith(f"{path}:") or len(text) > 2_000:

@@ -13,7 +13,6 @@ so that the sum of both is the link in the URDF.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -22,7 +21,6 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
-from fflin.robot.equipment.mounting import inertia_of, point_inertia
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
 # First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
@@ -463,22 +461,11 @@ class Slosh(_Part):
 Appendage: TypeAlias = FlexibleAppendage | Slosh
 
 
-def checked_appendages(value: object) -> tuple[Appendage, ...]:
-    """Return the given flexible appendages and slosh if they are valid, or raise `InputError`."""
-    if isinstance(value, Appendage):
-        value = [value]
-    if not isinstance(value, Sequence) or not all(isinstance(item, Appendage) for item in value):
-        raise InputError(
-            f"appendages is {value!r}, expected a sequence of FlexibleAppendage and Slosh"
-        )
-    return tuple(value)
-
-
 def rigid_inertia(M: Array) -> pin.Inertia:
     """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
-    mass = float(M[0, 0])
-    lever = np.array([M[1, 5], M[2, 3], M[0, 4]]) / mass
-    return inertia_of(mass, lever, M[3:, 3:] - point_inertia(mass, lever))
+    # Mass, first moments, and the moments of inertia xx, xy, yy, xz, yz, zz.
+    entries = M[[0, 1, 2, 0, 3, 3, 4, 3, 4, 5], [0, 5, 3, 4, 3, 4, 4, 5, 5, 5]]
+    return pin.Inertia.FromDynamicParameters(entries)
 
 
 def _text(what: str, value: Any) -> str:

@@ -1,92 +1,97 @@
-"""A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model."""
+r"""A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model.
+
+Each mode with participation L is equivalent to one ball on one screw joint. The ball's spatial
+inertia I and the twist S per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted
+from the link's inertia, so that the sum of both is the link in the URDF.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
-from fflin.robot.equipment.appendage_bodies import mounted_appendages
+from fflin.base.errors import FflinWarning, InputError
+from fflin.base.names import stands_for_any
+from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import (
     Appendage,
     FlexibleAppendage,
-    checked_appendages,
+    Slosh,
     rigid_inertia,
 )
 from fflin.robot.equipment.mounting import (
     Mounted,
-    difference,
-    inertia_of,
+    carrier_name,
     mounted_wheels,
+    turned_to,
     with_mounted,
 )
-from fflin.robot.fields import checked_inputs, of_joints
-from fflin.robot.joints import find_frame
+from fflin.robot.fields import checked_inputs
+from fflin.robot.joints import Joint, find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
+# An eigenvalue of M_rr - L L^T counts as negative if it is below minus this fraction of the
+# largest eigenvalue of M_rr.
+_NEGATIVE = 1e-9
+# A larger relative difference between mass properties of a file and of the URDF causes a warning.
+_AGREE = 1e-2
+# Largest fraction of a body's mass in the balls of its modes. CRBA sums inertias inwards, and the
+# mass of each sum must be positive.
+_LARGEST_SHARE = 0.9
+# Least distance of a ball from its appendage's frame, relative to the body's radius of gyration,
+# for which the ball's motion counts as a rotation about the frame.
+_SHORTEST = 0.05
+# Least mass of a ball, relative to the mass with which no rotor is needed.
+_LIGHTEST = 1e-6
+# If the translation part of a participation is below this fraction of the rotation part, or vice
+# versa, it counts as zero.
+_NONE = 1e-14
 
-def with_inputs(robot: Robot, inputs: object) -> Robot:
-    """Return a robot with other inputs, and with the wheels among them as joints."""
-    return _equipped(robot, inputs, robot.appendages)
-
-
-def with_appendages(robot: Robot, appendages: object) -> Robot:
-    """Return a robot with other flexible appendages and slosh, whose modes are joints."""
-    checked = checked_appendages(appendages)
-    bare, taken = robot._bare, set[int]()
-    for item in checked:
-        if isinstance(item, FlexibleAppendage) and item.rigid and item.inertia is not None:
-            joint = find_frame(bare.model, item.frame).joint
-            if joint in taken:
-                raise InputError(
-                    f"'{item.title}' is the second appendage with rigid=True on its body; use "
-                    "rigid=True for only one appendage of each body"
-                )
-            taken.add(joint)
-            bare = _with_rigid(bare, item)
-    if taken:
-        robot = replace(robot, links=bare.links, urdf_sha256=bare.urdf_sha256, _unequipped=bare)
-        checked = tuple(
-            replace(item, rigid=False) if isinstance(item, FlexibleAppendage) else item
-            for item in checked
-        )
-    return _equipped(robot, robot.inputs, checked)
+# Fields of a robot by names of joints, and the groups of names in their keys.
+_BY_JOINT = ("stiffness", "damping", "rest", "urdf_damping", "limits", "weights")
+_STATES = ("point", "target", "start")
+_GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
 
 
-def _with_rigid(bare: Robot, item: FlexibleAppendage) -> Robot:
-    """Return a robot in which the appendage's link has the inertia from the appendage's file."""
-    assert item.inertia is not None
-    joint, placement = find_frame(bare.model, item.frame)
-    of_file, body = rigid_inertia(item.inertia), bare.model.inertias[joint]
-    placed = of_file.se3Action(placement)
-    of_link, links = body, dict(bare.links)
-    if link := bare.pieces.get(item.frame):
-        of_link = as_inertia(link)
-    if item.frame in links:
-        at_center = pin.SE3(np.eye(3), of_file.lever)
-        links[item.frame] = LinkMass(of_file.mass, of_file.inertia, at_center)
-    rest = difference(body, of_link)
-    negative = inertia_of(-placed.mass, placed.lever, -placed.inertia)
-    return replace(bare.with_bodies({joint: difference(rest, negative)}), links=links)
+def equipped(
+    robot: Robot,
+    bare: Robot | None = None,
+    *,
+    inputs: object = None,
+    appendages: Sequence[Appendage] | None = None,
+) -> Robot:
+    """Return a robot with other inputs, appendages or another robot without equipment.
 
-
-def _equipped(robot: Robot, inputs: object, appendages: Sequence[Appendage]) -> Robot:
-    bare = robot._bare
-    checked = checked_inputs(inputs, bare.joint, bare.joint_names, robot.passive)
+    What is not given remains the same. Wheels with inertia and modes become joints, and fields lose
+    the entries of joints that no longer exist.
+    """
+    before, bare = robot._bare, bare or robot._bare
+    checked = checked_inputs(
+        robot.inputs if inputs is None else inputs, bare.joint, bare.joint_names, robot.passive
+    )
     model, joints, followers = bare.model, bare.joints, bare.followers
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
-    wheels = mounted_wheels(model, bodies, checked)
-    modes, springs = mounted_appendages(model, bodies, appendages, bare.pieces)
-    parts = [*wheels, *modes]
+    parts = mounted_wheels(model, bodies, checked)
+    items = robot.appendages if appendages is None else tuple(appendages)
+    parts += _mounted_modes(bare, bodies, items)
     if parts:
-        _require_new_names(model, parts)
+        taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
+        for part in parts:
+            if part.name in taken:
+                raise InputError(
+                    f"'{part.name}' has the name of another joint, frame, wheel or mode of the "
+                    "robot; give the wheel or the appendage another name"
+                )
+            taken.add(part.name)
         model = with_mounted(model, bodies, parts)
         for part in parts:
             model.addJointFrame(model.getJointId(part.name))
@@ -94,38 +99,319 @@ def _equipped(robot: Robot, inputs: object, appendages: Sequence[Appendage]) -> 
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
-    own = {joint.name for joint in robot.joints if joint.mode}
-    by_joint: dict[str, Any] = {
-        field: {name: x for name, x in getattr(robot, field).items() if name in names}
-        for field in ("stiffness", "damping", "rest")
+    gone = [name for name in robot.joint_names if name not in names]
+    fields = {
+        name: _without(getattr(robot, name), gone, names) for name in (*_BY_JOINT, *_STATES) if gone
     }
-    for field, values in springs.items():
-        if appendages is robot.appendages:  # their springs may have been replaced since
-            break
-        by_joint[field] = {k: x for k, x in by_joint[field].items() if k not in own} | values
-    for field in ("point", "target", "start"):
-        by_joint[field] = of_joints(getattr(robot, field), names)
+    modes = {joint.name for joint in robot.modes}
+    # Without new appendages, the springs of modes may have been replaced since.
+    for name in ("stiffness", "damping") if appendages is not None else ():
+        of_joints = fields.get(name, getattr(robot, name))
+        fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
+        for item in items:
+            fields[name] |= item.springs[name]
+    # Locked joints are not named here, because the robot without equipment lacks them as well.
+    removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
     return replace(
         robot,
-        **{"model": model, "joints": joints, "followers": followers, "inputs": checked},
-        appendages=tuple(appendages),
+        **{"model": model, "joints": joints, "followers": followers, "inputs": checked, **fields},
+        links=bare.links,
+        urdf_sha256=bare.urdf_sha256,
+        appendages=items,
         _unequipped=bare if parts else None,
-        _removed=tuple(
-            dict.fromkeys(
-                name for name in (*robot._removed, *robot.joint_names) if name not in names
-            )
-        ),
-        **by_joint,
+        _removed=tuple(name for name in dict.fromkeys(removed) if name not in names),
     )
 
 
-def _require_new_names(model: pin.Model, parts: Sequence[Mounted]) -> None:
-    """Raise `InputError` if two joints would have the same name."""
-    taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
-    for part in parts:
-        if part.name in taken:
+def _without(
+    of: Mapping[str, object], gone: Iterable[str], left: Iterable[str]
+) -> dict[str, object]:
+    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
+    removed, others = (
+        [f"{group}.{name}" for group in _GROUPS for name in names] for names in (gone, left)
+    )
+    return {
+        key: _without(value, gone, left) if isinstance(value, Mapping) else value
+        for key, value in of.items()
+        if stands_for_any(key, others) or not stands_for_any(key, removed)
+    }
+
+
+def with_appendages(robot: Robot, appendages: object) -> Robot:
+    """Return a robot with other flexible appendages and slosh, whose modes are joints."""
+    given = [appendages] if isinstance(appendages, Appendage) else appendages
+    if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
+        raise InputError(
+            f"appendages is {given!r}, expected a sequence of FlexibleAppendage and Slosh"
+        )
+    bare, taken = robot._bare, set[int]()
+    for item in given:
+        if not isinstance(item, FlexibleAppendage) or not item.rigid or item.inertia is None:
+            continue
+        joint, placement = find_frame(bare.model, item.frame)
+        if joint in taken:
             raise InputError(
-                f"'{part.name}' has the name of another joint, frame, wheel or mode of the robot; "
-                "give the wheel or the appendage another name"
+                f"'{item.title}' is the second appendage with rigid=True on its body; use "
+                "rigid=True for only one appendage of each body"
             )
-        taken.add(part.name)
+        taken.add(joint)
+        # The link has the inertia from the appendage's file in place of its own.
+        of_file, body, links = rigid_inertia(item.inertia), bare.model.inertias[joint], bare.links
+        own = as_inertia(bare.pieces[item.frame]) if item.frame in bare.pieces else body
+        if item.frame in links:
+            at_center = pin.SE3(np.eye(3), of_file.lever)
+            links = {**links, item.frame: LinkMass(of_file.mass, of_file.inertia, at_center)}
+        body = body - own + of_file.se3Action(placement)
+        bare = replace(bare.with_bodies({joint: body}), links=links)
+    items = [
+        replace(item, rigid=False) if isinstance(item, FlexibleAppendage) else item
+        for item in given
+    ]
+    return equipped(robot, bare, appendages=items)
+
+
+class _Modes(NamedTuple):
+    """Appendage on a body, with its participation L (6, k) in the body's frame."""
+
+    appendage: Appendage
+    joint: int
+    placement: pin.SE3
+    L: Array  # rows: translation, rotation about the body's origin
+
+
+def _seen(model: pin.Model, item: Appendage) -> _Modes:
+    joint, placement = find_frame(model, item.frame)
+    R, p = placement.rotation, placement.translation
+    t, r = (R @ part for part in np.split(item.participation, 2))
+    r = r + np.cross(p, t, axisb=0, axisc=0)
+    return _Modes(item, joint, placement, np.vstack((t, r)))
+
+
+def _mounted_modes(
+    bare: Robot, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
+) -> list[Mounted]:
+    """Return the bodies of all modes, and subtract them from the bodies that carry them."""
+    found = [_seen(bare.model, item) for item in appendages]
+    for item in found:
+        _compare_inertia(item, bodies[item.joint], bare)
+    for joint in dict.fromkeys(item.joint for item in found):
+        on_body = [item for item in found if item.joint == joint]
+        L = np.hstack([item.L for item in on_body])
+        body = bodies[joint]
+        rows = np.array([body.mass]), body.lever[None], body.inertia[None]
+        names = [name for item in on_body for name in item.appendage.modes]
+        for k, mode in enumerate(names, start=1):
+            least = float(_least_eigenvalue(*rows, L[:, :k])[0])
+            if not least >= -_NEGATIVE:
+                raise InputError(
+                    f"the effective masses of the modes up to '{mode}' exceed the inertia of "
+                    f"{carrier_name(bare.model, joint)} ({body.mass:.4g} kg): M_rr - L L^T has "
+                    f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the "
+                    "inertia in the URDF must include the appendage as if it were rigid"
+                )
+    parts: list[Mounted] = []
+    for item in found:
+        if isinstance(item.appendage, Slosh):
+            parts += _liquid(item.appendage, item, bodies)
+    balls: dict[int, list[_Ball]] = {}
+    for item in found:
+        if isinstance(item.appendage, FlexibleAppendage):
+            balls.setdefault(item.joint, []).extend(_balls(item, bodies[item.joint]))
+    for joint in sorted(balls):
+        mass = sum(ball.mass for ball in balls[joint])
+        lighter = min(1.0, _LARGEST_SHARE * bodies[joint].mass / mass) if mass else 1.0
+        if lighter < _LIGHTEST:
+            raise InputError(
+                f"mode '{balls[joint][0].name}' moves the centre of mass of its body, but without "
+                f"the sloshing liquid this body has only {bodies[joint].mass:.3g} kg; the mass in "
+                "the URDF must include the appendage and the liquid"
+            )
+        for ball in balls[joint]:
+            part, removed = ball.mounted(joint, lighter)
+            parts.append(part)
+            bodies[joint] = bodies[joint] - removed
+    return parts
+
+
+def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
+    """Return {mode: effective masses and moments of inertia (6,)} in the appendage's frame.
+
+    The values are fractions of the rigid inertia about the frame's origin. This is the inertia of
+    the appendage's file, or without one, the inertia of the body that carries the appendage.
+    """
+    found: dict[str, Array] = {}
+    for item in appendages:
+        joint, placement = find_frame(model, item.frame)
+        total = model.inertias[joint].se3Action(placement.inverse()).matrix()
+        if isinstance(item, FlexibleAppendage) and item.inertia is not None:
+            total = item.inertia
+        shares = item.participation.T**2 / np.maximum(total.diagonal(), 1e-300)
+        found |= dict(zip(item.modes, shares, strict=True))
+    return found
+
+
+def _compare_inertia(item: _Modes, body: pin.Inertia, bare: Robot) -> None:
+    """Warn if a file's rigid inertia differs from the link's."""
+    appendage = item.appendage
+    if not isinstance(appendage, FlexibleAppendage) or appendage.inertia is None:
+        return
+    what = f"the body with frame '{appendage.frame}'"
+    if (link := bare.pieces.get(appendage.frame)) is not None:
+        body, what = as_inertia(link), f"link '{appendage.frame}'"
+    of_file, of_link = rigid_inertia(appendage.inertia), body.se3Action(item.placement.inverse())
+    M = of_link.matrix()
+    scale = np.array([1.0, 1.0, 1.0, *[1.0 / _radius_of_gyration(of_link)] * 3])
+    apart = np.abs(M - appendage.inertia) * np.outer(scale, scale)
+    if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
+        file, urdf = (
+            f"{x.mass:.4g} kg at ({', '.join(f'{r:.4g}' for r in x.lever)}) m"
+            for x in (of_file, of_link)
+        )
+        warnings.warn(
+            f"flexible appendage '{appendage.title}': the inertia in its file ({file}) differs "
+            f"from the inertia of {what} ({urdf} in the axes of the frame) in these values or in "
+            "the moments of inertia; correct the URDF, or use the inertia of the file with "
+            "rigid=True",
+            FflinWarning,
+            stacklevel=6,
+        )
+
+
+def _radius_of_gyration(body: pin.Inertia) -> float:
+    """Return the root mean square distance [m] of a body's mass from the origin."""
+    trace = max(float(np.trace(body.matrix()[3:, 3:])), 1e-300)
+    return math.sqrt(trace / max(2.0 * body.mass, 1e-300))
+
+
+def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
+    """Return the least eigenvalue (N,) of M_rr - L L^T, relative to the largest one of M_rr.
+
+    M_rr follows from masses (N,), centres of mass (N, 3), and inertias (N, 3, 3) about them.
+    """
+    # M_rr is scaled: about the centre of mass, with unit mass and unit radius of gyration.
+    trace = np.trace(inertia, axis1=1, axis2=2)
+    size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
+    t, r = np.split(L, 2)
+    modes = np.empty((len(mass), *L.shape))
+    modes[:, :3] = t
+    modes[:, 3:] = (r - np.cross(center[:, :, None], t[None], axis=1)) / size
+    M = np.zeros((len(mass), 6, 6))
+    M[:, :3, :3], M[:, 3:, 3:] = mass[:, None, None] * np.eye(3), inertia / size**2
+    left = M - modes @ modes.swapaxes(1, 2)
+    least = np.full(len(mass), -np.inf)
+    finite = np.isfinite(left).all(axis=(1, 2))
+    largest = np.linalg.eigvalsh(M[finite])[:, -1]
+    least[finite] = np.linalg.eigvalsh(left[finite])[:, 0] / largest
+    return least
+
+
+def first_impossible(
+    model: pin.Model,
+    appendages: Sequence[Appendage],
+    bodies: Mapping[int, tuple[Array, Array, Array]],
+) -> int | None:
+    """Return the first of N rows in which modes need more inertia than their body has.
+
+    `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
+    Return None if all rows are possible.
+    """
+    found = [_seen(model, item) for item in appendages]
+    impossible = []
+    for joint, rows in bodies.items():
+        if of_body := [item.L for item in found if item.joint == joint]:
+            least = _least_eigenvalue(*rows, np.hstack(of_body))
+            impossible += np.flatnonzero(~(least >= -_NEGATIVE)).tolist()
+    return min(impossible, default=None)
+
+
+class _Ball(NamedTuple):
+    """Ball that represents a mode, in the frame of the body that carries it."""
+
+    name: str
+    t: Array  # (3,) translation part of the participation
+    r: Array  # (3,) rotation part of the participation about the ball's centre
+    center: Array
+    mass: float  # [kg] mass with which no rotor is needed
+    moment: float  # [kg m^2] moment of inertia of the ball
+    rotation: float  # [rad] of the structure per unit of the amplitude
+
+    def mounted(self, joint: int, lighter: float) -> tuple[Mounted, pin.Inertia]:
+        """Return the ball on its joint, and the inertia to subtract from the body.
+
+        The ball has the fraction `lighter` of `mass`.
+        """
+        mass = lighter * self.mass
+        v = self.t / mass if mass else np.zeros(3)
+        w = self.r / self.moment if self.moment else np.zeros(3)
+        # The inertia of a rotor compensates a different mass of the ball: S^T I S + rotor = 1.
+        rotor = 1.0 - float(self.t @ v + self.r @ w)
+        rotor = 0.0 if abs(rotor) < 1e-13 else rotor
+        moving, turning = float(np.linalg.norm(v)), float(np.linalg.norm(w))
+        if turning:
+            axis, scale = w / turning, turning
+            origin: Array = self.center + np.cross(w, v) / turning**2
+            pitch = float(v @ w) / turning**2
+            motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+        else:
+            axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
+            origin, motion = self.center, pin.JointModelPZ()
+        R, sphere = turned_to(axis), self.moment * np.eye(3)
+        own = pin.Inertia(mass, R.T @ (self.center - origin), sphere)
+        mode = Joint(
+            self.name, prismatic=not turning, kind="modal", scale=scale, rotation=self.rotation
+        )
+        part = Mounted(mode, joint, pin.SE3(R, origin), motion, own, rotor / scale**2)
+        return part, pin.Inertia(mass, self.center, sphere)
+
+
+def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
+    """Return a ball for each mode of a flexible appendage."""
+    p, size = item.placement.translation, _radius_of_gyration(body)
+    balls = []
+    for name, column in zip(item.appendage.modes, item.L.T, strict=True):
+        # Refer participation to the appendage's frame: only there, a pure translation has r = 0.
+        t, r = column[:3], column[3:] - np.cross(p, column[:3])
+        square, center = float(t @ t), np.zeros(3)
+        if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
+            center = np.cross(t, r) / square
+            # Limit the ball's distance to the body's radius of gyration.
+            center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
+        else:
+            t, square = np.zeros(3), 0.0
+        r = r - np.cross(center, t)
+        rest = float(np.linalg.norm(r))
+        far = max(size, float(np.linalg.norm(p))) * math.sqrt(square)
+        if rest <= _NONE * max(far, float(np.linalg.norm(column[3:]))):
+            r, rest = np.zeros(3), 0.0
+        moment = rest**2 + size**2 * square if rest else 0.0
+        mass = square + (rest / size) ** 2 if square else 0.0
+        # Per unit of the amplitude, the ball rotates by w and moves by v. It is at the distance c
+        # from the appendage's frame. The rotation of the structure is at most |w| + |v| / |c|.
+        lever, rotation = float(np.linalg.norm(center)), rest / moment if moment else 0.0
+        if mass and lever >= _SHORTEST * size:
+            rotation += math.sqrt(square) / mass / lever
+        balls.append(_Ball(name, t, r, p + center, mass, moment, rotation))
+    return balls
+
+
+def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
+    """Return a slosh mass as two joints, the second with the mass; subtract it from the body."""
+    joint, placement = item.joint, item.placement
+    x, y, z = (placement.rotation @ slosh.axes).T
+    at, point = placement * np.array(slosh.position), np.zeros((3, 3))
+    bodies[joint] = bodies[joint] - pin.Inertia(slosh.mass, at, point)
+    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, and so also
+    # moves along x and y.
+    slides = slosh.length is None
+    arm = (slosh.length or 0.0) * z
+    first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
+    inertia, rotation = slosh.modal_mass, float(not slides)
+    across = [
+        Joint(name, prismatic=slides, kind="slosh", inertia=inertia, rotation=rotation)
+        for name in slosh.modes
+    ]
+    motion = pin.JointModelPZ if slides else pin.JointModelRZ
+    between = pin.SE3(first.T @ second, np.zeros(3))
+    mass = pin.Inertia(slosh.mass, second.T @ -arm, point)
+    outer = Mounted(across[0], joint, pin.SE3(first, at + arm), motion(), pin.Inertia.Zero())
+    return [outer, Mounted(across[1], slosh.modes[0], between, motion(), mass)]

@@ -10,9 +10,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.urdf.links import is_impossible
-
-_Z = np.array([0.0, 0.0, 1.0])
+from fflin.robot.urdf.description import is_impossible
 
 # Arrays of a Pinocchio model: first those with an entry for each entry of v, then for each entry
 # of q.
@@ -42,32 +40,6 @@ class Mounted(NamedTuple):
     def name(self) -> str:
         """Name of the joint."""
         return self.joint.name
-
-
-def inertia_of(mass: float, lever: Array, inertia: Array) -> pin.Inertia:
-    """Return a spatial inertia that need not be the inertia of a real body."""
-    # Pinocchio's constructor refuses physically impossible inertias. But a link minus its mounted
-    # bodies is only a term of a sum, so it may be impossible.
-    value = pin.Inertia.Zero()
-    value.mass, value.lever, value.inertia = mass, lever, inertia
-    return value
-
-
-def difference(body: pin.Inertia, part: pin.Inertia) -> pin.Inertia:
-    """Return a body minus one of its parts; both are in the same frame."""
-    mass = body.mass - part.mass
-    if part.mass == 0.0:
-        return inertia_of(mass, body.lever, body.inertia - part.inertia)
-    moment = body.mass * body.lever - part.mass * part.lever
-    moments = body.inertia + point_inertia(body.mass, body.lever)
-    moments = moments - (part.inertia + point_inertia(part.mass, part.lever))
-    lever = moment / mass if mass else np.zeros(3)
-    return inertia_of(mass, lever, moments - point_inertia(mass, lever))
-
-
-def point_inertia(mass: float, lever: Array) -> Array:
-    """Return the inertia (3, 3) of a point mass about the origin."""
-    return mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
 
 
 def with_mounted(
@@ -160,26 +132,30 @@ def mounted_wheels(
         if not wheel.inertia:
             continue
         joint, axis = carrier(model, wheel)
-        spinning = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(axis, axis))
-        rest = difference(bodies[joint], spinning)
+        spinning = pin.Inertia(0.0, np.zeros(3), wheel.inertia * np.outer(axis, axis))
+        rest = bodies[joint] - spinning
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
         # If the link is the wheel itself, only rounding errors of its inertia remain.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
-            of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
                 f"wheel '{name}' of {wheel.inertia:g} kg m^2 must have less inertia than the "
-                f"link that carries it, but {of} has {about:.3g} kg m^2 about the axis of the "
-                "wheel; the inertia in the URDF must include the wheels, so correct the URDF or "
-                f"the wheel{lock}"
+                f"link that carries it, but {carrier_name(model, joint)} has {about:.3g} kg m^2 "
+                "about the axis of the wheel; the inertia in the URDF must include the wheels, so "
+                f"correct the URDF or the wheel{lock}"
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
-        own = pin.Inertia(0.0, np.zeros(3), float(wheel.inertia) * np.outer(_Z, _Z))
+        own = pin.Inertia(0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia]))
         turning = Joint(name, unbounded=True)
         parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), own))
     return parts
+
+
+def carrier_name(model: pin.Model, joint: int) -> str:
+    """Return the name of the body on a joint, for messages."""
+    return "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
 
 
 def turned_to(axis: Array) -> Array:

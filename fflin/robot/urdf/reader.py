@@ -6,23 +6,24 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import pinocchio as pin
 
 from fflin.base.errors import MissingPackageError, UrdfError
 from fflin.base.process import import_path_without
 from fflin.base.writing import read_file, remember
-from fflin.robot.urdf.joints import (
+from fflin.robot.urdf.description import (
+    INERTIA,
     UNLIMITED,
     JointElement,
+    Link,
     Mimic,
-    Urdf,
-    counted_leaders,
-    read_description,
+    Pose,
+    inertia_notes,
+    read_tree,
     resolve_mimics,
 )
-from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 _SIZE_LIMIT = 64 * 2**20
@@ -30,6 +31,8 @@ _SIZE_LIMIT = 64 * 2**20
 # Up to this depth, the recursion of the parsers fits into the smallest stack of a thread, 512 kB.
 _SHALLOW = 100
 _STACK = 16 * 2**20
+
+_UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
 
 # Characters that must be escaped in values of attributes.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
@@ -48,112 +51,111 @@ _IGNORED = {
 }
 
 
-class Advice(NamedTuple):
-    """Warning about joints that is dropped if a field of the robot names all of them."""
-
-    field: str
-    joints: tuple[str, ...]
-    note: str
+# Warning about joints that is dropped if a field of the robot names all of them: the name of the
+# field, the joints and the warning.
+Advice: TypeAlias = tuple[str, tuple[str, ...], str]
 
 
-class Description(NamedTuple):
-    """Content of a robot's file."""
+class Urdf(NamedTuple):
+    """Checked content of a robot's file."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
     sha256: str  # digest of the file that was read, without files that a xacro includes
+    links: dict[str, Link]  # in the order of the file
+    joints: dict[str, JointElement]
     mimics: dict[str, Mimic]  # {mimic joint: Mimic} with independent leaders
-    damping: dict[str, float]  # {joint: value} of nonzero damping [N m s/rad | N s/m]
-    meshes: tuple[str, ...]  # mesh files as written in the file; they are not read
-    links: dict[str, Link]  # links with mass
-    joints: tuple[str, ...]  # all joints in the order of the file
+    meshes: set[str]  # mesh files as written in the file; they are not read
     notes: tuple[str, ...]  # warnings, one line each
-    advice: tuple[Advice, ...] = ()  # warnings that fields of the robot may make unnecessary
+    advice: tuple[Advice, ...]  # warnings that fields of the robot may make unnecessary
 
 
-def read_urdf(path: Path) -> Description:
+def read_urdf(path: Path) -> Urdf:
     """Read a URDF or xacro file as a free-flying robot."""
     return describe(read_document(path), path)
 
 
-def describe(document: bytes, path: Path) -> Description:
+def describe(document: bytes, path: Path) -> Urdf:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
-    root = parse(document, str(path))
-    notes: list[str] = []
-    # Search for text that indicates xacro, or for characters that may encode such text.
-    plain = document.replace(b"\0", b"")  # so that UTF-16 is searched too
-    first = first_xacro(root) if any(x in plain for x in (b"xacro:", b"$", b"&#")) else None
-    if path.suffix == ".xacro" or first:
-        expanded, notes = expand(path, document, first)
-        root = parse(expanded, f"{path} as expanded by xacro")
-    urdf = read_description(root)
-    mimics = resolve_mimics(urdf.joints)
-    model = _build(urdf, path, counted_leaders(urdf.joints, mimics))
-    notes += notes_of(root)
-    notes += inertia_notes(urdf.links.values(), model, path.stem)
-    moving = [joint for joint in urdf.joints.values() if joint.freedom]
-    damping = {joint.name: joint.damping for joint in moving if joint.damping}
-    return Description(
-        model,
-        hashlib.sha256(document).hexdigest(),
-        mimics,
-        damping,
-        tuple({e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}),
-        links={name: link for name, link in urdf.links.items() if link.mass},
-        joints=tuple(urdf.joints),
-        notes=tuple(notes),
-        advice=tuple(_advice(moving, path.stem)),
-    )
-
-
-def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
-    """Yield warnings about dampers, friction and zero limits that the model ignores."""
-    damped = tuple(joint.name for joint in moving if joint.damping)
-    rubbing = tuple(joint.name for joint in moving if joint.friction)
-    zero = {
-        what: tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
-        for what in ("effort", "velocity")
+    root, notes = plain_root(document, path)
+    links, joints, depth = read_tree(root)
+    mimics = resolve_mimics(joints)
+    # The joint model of a continuous joint does not count turns. Leaders count them if a full turn
+    # leaves a mimic joint displaced.
+    counted = {
+        mimic.leader
+        for name, mimic in mimics.items()
+        if joints[name].type != "continuous" or not mimic.multiplier.is_integer()
     }
-    if damped:
-        yield Advice("damping", damped, f"{origin}: damping unused: {enumerated(damped)}")
-    if rubbing:
-        text = f"{origin}: Coulomb friction unused: {enumerated(rubbing)}"
-        yield Advice("friction", rubbing, text)
-    for joints in dict.fromkeys(filter(None, zero.values())):
-        of = named("joint", joints) if len(joints) < 3 else f"{len(joints)} joints"
-        limits = ", ".join(what for what, names in zero.items() if names == joints)
-        text = f"{origin}: {limits} 0 of {of}: no limit (or passive)"
-        yield Advice("passive", joints, text)
-
-
-def read_document(path: Path) -> bytes:
-    """Return the content of a URDF file, or raise `FileError`."""
-    return read_file(path, "URDF", _SIZE_LIMIT)
-
-
-def _build(urdf: Urdf, path: Path, counted: Collection[str]) -> pin.Model:
     root_joint = "root_joint"
-    while root_joint in urdf.joints or root_joint in urdf.links:
+    while root_joint in joints or root_joint in links:
         root_joint += "_"
-    document = write_urdf(urdf, counted)
+    name = root.attributes.get("name", "").strip()
+    clean = write_urdf(name, links, joints, counted)
     try:
         model = _with_stack(
-            urdf.depth,
-            lambda: pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint),
+            depth, lambda: pin.buildModelFromXML(clean, pin.JointModelFreeFlyer(), root_joint)
         )
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
-    moving = {joint.name for joint in urdf.joints.values() if joint.freedom}
-    if set(model.names) != {"universe", root_joint, *moving} or "universe" in moving:
+    moving = [joint for joint in joints.values() if joint.freedom]
+    names = {"universe", root_joint, *(joint.name for joint in moving)}
+    if set(model.names) != names or len(names) != 2 + len(moving):
         raise UrdfError(
             f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
             "joints with unusual names"
         )
     model.gravity.setZero()
     # File names may contain bytes that are not valid text.
-    model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
-    return model
+    model.name = name or path.stem.encode(errors="backslashreplace").decode()
+    notes += [*notes_of(root), *inertia_notes(links.values(), model, path.stem)]
+    meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
+    advice = tuple(_advice(moving, path.stem))
+    digest = hashlib.sha256(document).hexdigest()
+    return Urdf(model, digest, links, joints, mimics, meshes, tuple(notes), advice)
+
+
+def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
+    """Parse a document, expanding any xacro in it; return its root and the messages of xacro."""
+    root = parse(document, str(path))
+    # Search for text that indicates xacro, or for characters that may encode such text.
+    text = document.replace(b"\0", b"")  # so that UTF-16 is searched too
+    first = None
+    if any(x in text for x in (b"xacro:", b"$", b"&#")):
+        for element in chain([root], root.iterate(_IGNORED)):
+            marked = any("${" in x or "$(" in x for x in element.attributes.values())
+            # Declaring the prefix is not a use.
+            if marked or element.tag.startswith("xacro:"):
+                first = element
+                break
+    if path.suffix != ".xacro" and not first:
+        return root, []
+    expanded, notes = _expand(path, document, first)
+    return parse(expanded, f"{path} as expanded by xacro"), notes
+
+
+def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
+    """Yield warnings about dampers, friction and zero limits that the model ignores."""
+    damped = tuple(joint.name for joint in moving if joint.damping)
+    rubbing = tuple(joint.name for joint in moving if joint.friction)
+    if damped:
+        yield "damping", damped, f"{origin}: damping unused: {enumerated(damped)}"
+    if rubbing:
+        yield "friction", rubbing, f"{origin}: Coulomb friction unused: {enumerated(rubbing)}"
+    zero = {
+        what: tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
+        for what in ("effort", "velocity")
+    }
+    for joints in dict.fromkeys(filter(None, zero.values())):
+        of = named("joint", joints) if len(joints) < 3 else f"{len(joints)} joints"
+        limits = ", ".join(what for what, names in zero.items() if names == joints)
+        yield "passive", joints, f"{origin}: {limits} 0 of {of}: no limit (or passive)"
+
+
+def read_document(path: Path) -> bytes:
+    """Return the content of a URDF file, or raise `FileError`."""
+    return read_file(path, "URDF", _SIZE_LIMIT)
 
 
 def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
@@ -171,76 +173,56 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
         return built.result()
 
 
-def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
+def write_urdf(
+    name: str,
+    links: Mapping[str, Link],
+    joints: Mapping[str, JointElement],
+    counted: Collection[str],
+) -> str:
     """Return a URDF of links, inertias and joints with exact numbers.
 
     `counted` continuous joints become revolute, so that they count full turns.
     """
+    parts = []
+    for link in links.values():
+        inertial = ""
+        if link.mass is not None:
+            inertia = _tag("inertia", dict(zip(INERTIA, link.inertia, strict=True)))
+            mass = _tag("mass", {"value": link.mass})
+            inertial = _tag("inertial", {}, _origin(link.com) + mass + inertia)
+        parts.append(_tag("link", {"name": link.name}, inertial))
+    for joint in joints.values():
+        kind, limits = joint.type, _UNBOUNDED if joint.limits is None else joint.limits
+        if kind == "continuous" and joint.name in counted:
+            kind, limits = "revolute", limits | _UNBOUNDED
+        inside = _tag("parent", {"link": joint.parent}) + _tag("child", {"link": joint.child})
+        inside += _origin(joint.origin) + _tag("axis", {"xyz": joint.axis})
+        inside += _tag("dynamics", {"damping": joint.damping, "friction": joint.friction})
+        if kind in ("revolute", "prismatic") or joint.limits:
+            inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
+        parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
     # Version 1.1 is the first for which urdfdom reads quat_xyzw; 1.2 would require limits.
-    lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
-    for link in urdf.links.values():
-        lines.extend(_link(link))
-    for joint in urdf.joints.values():
-        lines.extend(_joint(joint, joint.name in counted))
-    lines.append("</robot>")
-    return "\n".join(lines)
-
-
-def _link(link: Link) -> Iterator[str]:
-    yield f"<link name={_quoted(link.name)}>"
-    if link.mass is not None:
-        yield f'<inertial>{_origin(link.com)}<mass value="{link.mass!r}"/>'
-        yield f"<inertia {_entries(dict(zip(INERTIA, link.inertia, strict=True)))}/></inertial>"
-    yield "</link>"
-
-
-def _joint(joint: JointElement, counted: bool) -> Iterator[str]:
-    unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
-    if counted:
-        joint = joint._replace(type="revolute", limits=(joint.limits or {}) | unbounded)
-    yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
-    yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
-    yield _origin(joint.origin)
-    if joint.freedom == 1:
-        yield f'<axis xyz="{_numbers(joint.axis)}"/>'
-        if joint.damping or joint.friction:
-            yield f'<dynamics damping="{joint.damping!r}" friction="{joint.friction!r}"/>'
-    if joint.type in ("revolute", "prismatic") or joint.limits:
-        limits = unbounded if joint.limits is None else joint.limits
-        yield f"<limit {_entries({'effort': UNLIMITED, 'velocity': UNLIMITED} | limits)}/>"
-    yield "</joint>"
+    return _tag("robot", {"name": name, "version": "1.1"}, "\n".join(parts))
 
 
 def _origin(pose: Pose) -> str:
-    attitude = f'rpy="{_numbers(pose.rpy)}"'
-    if pose.quaternion is not None:
-        attitude = f'quat_xyzw="{_numbers(pose.quaternion)}"'
-    return f'<origin xyz="{_numbers(pose.xyz)}" {attitude}/>'
+    if pose.quaternion is None:
+        return _tag("origin", {"xyz": pose.xyz, "rpy": pose.rpy})
+    return _tag("origin", {"xyz": pose.xyz, "quat_xyzw": pose.quaternion})
 
 
-def _entries(values: Mapping[str, float]) -> str:
-    return " ".join(f'{name}="{value!r}"' for name, value in values.items())
+def _tag(
+    tag: str, attributes: Mapping[str, str | float | tuple[float, ...]], inside: str = ""
+) -> str:
+    """Return an element; the standard library's functions would load many modules."""
+    text = f"<{tag}"
+    for name, value in attributes.items():
+        shown = " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
+        text += f' {name}="{shown.translate(_ENTITIES)}"'
+    return f"{text}>{inside}</{tag}>"
 
 
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(repr(value) for value in values)
-
-
-def _quoted(text: str) -> str:
-    """Quote an attribute's value; the standard library's functions would load many modules."""
-    return f'"{text.translate(_ENTITIES)}"'
-
-
-def first_xacro(root: Element) -> Element | None:
-    """Return the first element that uses xacro, or None; declaring the prefix is not a use."""
-    for element in chain([root], root.iterate(_IGNORED)):
-        marked = any("${" in value or "$(" in value for value in element.attributes.values())
-        if marked or element.tag.startswith("xacro:"):
-            return element
-    return None
-
-
-def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
+def _expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
     """Expand a xacro document to plain URDF, and return it with xacro's messages.
 
     `first` is the first element that uses xacro, for error messages.

@@ -48,9 +48,17 @@ class Element:
     attributes: dict[str, str]
     line: int  # line of its start tag
     origin: str  # name of the document in errors: the path of the file
+    owner: str = ""  # innermost link or joint that this element is or belongs to, as "joint 'a'"
     children: list[Element] = field(default_factory=list)
     # {warning: lines}, shared by all elements of the document.
     notes: dict[str, list[int]] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Name of this element for messages, such as "<axis> of joint 'a'"."""
+        if self.owner.startswith(f"{self.tag} "):
+            return self.owner
+        return f"<{self.tag}>{' of ' * bool(self.owner)}{self.owner}"
 
     def error(self, message: str) -> UrdfError:
         """Build an error that names the file and line of this element."""
@@ -64,22 +72,48 @@ class Element:
         """Return the children with a tag."""
         return [child for child in self.children if child.tag == tag]
 
-    def find(self, tag: str, of: str) -> Element | None:
-        """Return the only child with a tag, or None; `of` names this element in errors."""
+    def find(self, tag: str, *attributes: str) -> Element | None:
+        """Return the only child with a tag, or None.
+
+        If `attributes` are given, the child may have no others: a misspelt attribute is an error,
+        and any other unknown attribute causes a note.
+        """
         found = self.find_all(tag)
         if len(found) > 1:
             raise found[1].error(
-                f"{of} has a second <{tag}>; the first <{tag}> is in line {found[0].line}; keep "
-                "one of them"
+                f"{self.title} has a second <{tag}>; the first <{tag}> is in line {found[0].line}; "
+                "keep one of them"
             )
+        for child in found if attributes else ():
+            for name in child.attributes:
+                if name in attributes or ":" in name:
+                    continue
+                if nearest(name.lower(), attributes, _NEAR):
+                    raise child.error(
+                        f"{child.title} has an unknown attribute {quoted(name)}; known: "
+                        f"{', '.join(attributes)}; correct it or remove it"
+                    )
+                child.note(
+                    f"attribute {quoted(name)} of <{tag}> is ignored, because it is not part of "
+                    "URDF"
+                )
         return found[0] if found else None
 
-    def require(self, tag: str, of: str) -> Element:
-        """Return the only child with a tag, or raise `UrdfError` without one."""
-        found = self.find(tag, of)
+    def require(self, tag: str, *attributes: str) -> Element:
+        """Return the only child with a tag as `find` does, or raise `UrdfError` without one."""
+        found = self.find(tag, *attributes)
         if found is None:
-            raise self.error(f"{of} has no <{tag}>; add it")
+            raise self.error(f"{self.title} has no <{tag}>; add it")
         return found
+
+    def refuse_near_miss(self, *known: str) -> None:
+        """Raise `UrdfError` for misspelt known children; other unknown children are ignored."""
+        for child in self.children:
+            near = child.tag not in known and ":" not in child.tag
+            if near and (meant := nearest(child.tag.lower(), known, 0.85)):
+                raise child.error(
+                    f"<{child.tag}> in {self.title} is not known to URDF; did you mean <{meant}>?"
+                )
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
         """Yield all elements below this element in document order, except skipped subtrees."""
@@ -88,54 +122,37 @@ class Element:
                 yield child
                 yield from child.iterate(skip)
 
-    def allow_only(self, *names: str, of: str) -> None:
-        """Raise an error for misspelt attributes, and add a note about other unknown attributes."""
-        for name in self.attributes:
-            if name in names or ":" in name:
-                continue
-            if nearest(name.lower(), names, _NEAR):
-                raise self.error(
-                    f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
-                    f"{', '.join(names)}; correct it or remove it"
-                )
-            self.note(
-                f"attribute {quoted(name)} of <{self.tag}> is ignored, because it is not part of "
-                "URDF"
-            )
-
-    def text(self, name: str, of: str) -> str:
+    def text(self, name: str) -> str:
         """Return an attribute, or raise `UrdfError` if it is missing or empty."""
         value = self.attributes.get(name)
         if value is None or not value.strip():
             what = "has no" if value is None else "has an empty"
-            raise self.error(f"{of} {what} '{name}'; write <{self.tag} {name}=\"...\">")
+            raise self.error(f"{self.title} {what} '{name}'; write <{self.tag} {name}=\"...\">")
         return value
 
-    def number(self, name: str, of: str, default: float | None = None) -> float:
+    def number(self, name: str, default: float | None = None) -> float:
         """Return an attribute as a decimal number of at most 1e30."""
         if default is not None and name not in self.attributes:
             return default
-        return self._decimal(self.text(name, of).strip(_SPACE), f"{name} of {of}")
+        return self.vector(name, 1)[0]
 
-    def vector(self, name: str, of: str, size: int) -> tuple[float, ...]:
-        """Return an attribute as `size` finite decimal numbers."""
-        text = self.text(name, of)
+    def vector(self, name: str, size: int) -> tuple[float, ...]:
+        """Return an attribute as `size` decimal numbers of at most 1e30."""
+        text = self.text(name)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
-        if len(entries) != size:
-            raise self.error(
-                f"{name} of {of} is {quoted(text)}, which has {len(entries)} entries; expected "
-                f"{size} numbers separated by spaces, without commas"
+        values = tuple(map(decimal, entries))
+        wrong = [entry for entry, x in zip(entries, values, strict=True) if not abs(x) <= _LARGEST]
+        if len(values) != size or wrong:
+            right = len(values) == size
+            given = (
+                quoted(wrong[0]) if right else f"{quoted(text)}, which has {len(values)} entries"
             )
-        return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
-
-    def _decimal(self, text: str, what: str) -> float:
-        value = decimal(text)
-        if not abs(value) <= _LARGEST:
+            wanted = "a finite number, such as 0.5," if size == 1 else f"{size} finite numbers"
             raise self.error(
-                f"{what} is {quoted(text)}; expected a finite number, such as 0.5, of at most "
-                f"{_LARGEST:g}"
+                f"{name} of {self.title} is {given}; expected {wanted} of at most {_LARGEST:g}"
+                + ", separated by spaces, without commas" * (size > 1)
             )
-        return value
+        return values
 
 
 def decimal(text: str) -> float:
@@ -175,7 +192,11 @@ def parse(document: bytes, origin: str) -> Element:
     opened, count, parser = [top], 0, expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        element = Element(tag, attributes, parser.CurrentLineNumber, origin, [], top.notes)
+        owner, name = opened[-1].owner, attributes.get("name", "")
+        if tag in ("link", "joint") and name.strip():
+            owner = f"{tag} {quoted(name)}"
+        line = parser.CurrentLineNumber
+        element = Element(tag, attributes, line, origin, owner, notes=top.notes)
         if len(opened) > _DEPTH_LIMIT:
             raise element.error(
                 f"elements are nested more than {_DEPTH_LIMIT} deep; check for a missing end tag"

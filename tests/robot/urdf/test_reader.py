@@ -12,7 +12,7 @@ import pytest
 
 import fflin
 from fflin.robot.urdf import reader as expansion
-from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.description import Mimic
 from fflin.robot.urdf.reader import describe, read_urdf
 from fflin.robot.urdf.xml import parse
 from tests.support.messages import says
@@ -214,8 +214,8 @@ def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted)
 
 def test_damping_and_friction_are_recorded_and_noted():
     found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
-    assert found.damping == {"hinge": 0.25}
-    texts = [each.note for each in found.advice]
+    assert found.joints["hinge"].damping == 0.25
+    texts = [note for _, _, note in found.advice]
     assert ["damping" in text for text in texts] == [True, False]
     assert all("'hinge'" in text for text in texts)
     assert read(arm()).notes == read(arm()).advice == ()
@@ -225,8 +225,8 @@ def test_notes_name_six_joints_and_count_the_rest():
     links = [link(f"l{k}") for k in range(9)]
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
-    (advice,) = read(robot(*links, *joints)).advice
-    assert says(advice.note, "'j1', 'j2', 'j3', 'j4', 'j5', 'j6'", "2 more")
+    ((_, _, note),) = read(robot(*links, *joints)).advice
+    assert says(note, "'j1', 'j2', 'j3', 'j4', 'j5', 'j6'", "2 more")
 
 
 def test_blanks_at_the_end_of_a_name_are_seen():

@@ -1,0 +1,381 @@
+"""Checked content of a URDF: links with their inertias, joints, mimic joints, and their tree."""
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import unknown
+from fflin.base.validation import Array
+from fflin.robot.urdf.xml import Element, decimal, enumerated, named, quoted
+
+# Degrees of freedom of each joint type.
+FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floating=6)
+
+# Value of a missing limit in the model.
+UNLIMITED = sys.float_info.max
+
+# If a length is 1e8 m, adding 1 m^2 to its square changes nothing in double precision. The links'
+# moments about their own joints would be lost, and ABA would divide zero by zero.
+_FARTHEST = 1e7  # [m]
+
+# Tolerance of a quaternion's length: files often have four digits, seldom fewer.
+_QUATERNION_SLACK = 1e-3
+
+# An axis whose length is outside these bounds is an error in the file.
+_SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
+
+# A singular inertia has eigenvalues of about -1e-16 of the largest, because its six numbers are
+# rounded. The tolerance is larger because CAD programs write fewer digits.
+_NEGATIVE_SLACK = 1e-9
+
+# CAD programs give a point mass an inertia that is only a rounding error of either sign. It is no
+# larger than if the body extended this far from its centre.
+_POINT = 1e-6  # [m]
+
+# A negative moment is accepted below this fraction of the whole rigid body's moment. It changes M
+# by less than the rounding of published numbers does.
+_LOST_IN_BODY = 1e-6
+
+# Tolerance of the triangle inequality of principal moments. A flat plate fulfils it with equality,
+# and published numbers have three digits or more.
+TRIANGLE_SLACK = 1e-3
+
+# urdfdom and Pinocchio's parser recurse along the tree, and take about 2.5 kB of stack per link.
+_DEPTH_LIMIT = 1_000
+
+# Most robots have fewer than 100 links. The limit bounds computing time and memory.
+_LINK_LIMIT = 10_000
+
+# Entries of an inertia in the order of URDF.
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+class Pose(NamedTuple):
+    """Placement of a frame in another frame, as in the file."""
+
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]
+    quaternion: tuple[float, ...] | None = None  # x y z w of unit length, in place of rpy
+
+    @property
+    def placement(self) -> pin.SE3:
+        """The same placement for Pinocchio."""
+        if self.quaternion is not None:
+            return pin.XYZQUATToSE3(np.array([*self.xyz, *self.quaternion]))
+        return pin.SE3(pin.rpy.rpyToMatrix(*self.rpy), np.array(self.xyz))
+
+
+class Link(NamedTuple):
+    """One link, and the element that describes it."""
+
+    name: str
+    element: Element
+    mass: float | None = None  # [kg]; None without <inertial>
+    com: Pose = Pose()  # centre of mass, and axes of the inertia
+    inertia: tuple[float, ...] = (0.0,) * 6  # [kg m^2] about the centre of mass, as in INERTIA
+
+    @property
+    def tensor(self) -> Array:
+        """Inertia (3, 3) [kg m^2] about the centre of mass."""
+        xx, xy, xz, yy, yz, zz = self.inertia
+        return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+
+
+class Mimic(NamedTuple):
+    """A joint that moves with another: value = multiplier * leader's value + offset."""
+
+    leader: str
+    multiplier: float  # [rad/rad, m/rad, ...]
+    offset: float  # [rad|m]
+
+
+class JointElement(NamedTuple):
+    """One joint between two links, and the element that describes it."""
+
+    name: str
+    element: Element
+    type: str
+    parent: str
+    child: str
+    origin: Pose  # placement of the child's frame in the parent's frame
+    mimic: Mimic | None  # as in the file, where the leader may be a mimic joint too
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # in the child's frame, of any length
+    limits: dict[str, float] | None = None  # given lower, upper, effort, velocity
+    damping: float = 0.0  # [N m s/rad | N s/m]
+    friction: float = 0.0  # [N m | N]
+
+    @property
+    def freedom(self) -> int:
+        """Number of degrees of freedom."""
+        return FREEDOM[self.type]
+
+
+def read_link(element: Element) -> Link:
+    """Read a <link>, or raise `UrdfError` if it is invalid."""
+    name = element.text("name")
+    element.refuse_near_miss("inertial")
+    for misplaced in element.find_all("mass"):
+        raise misplaced.error(f"<mass> is directly in {element.title}; put it into an <inertial>")
+    inertial = element.find("inertial")
+    if inertial is None:
+        return Link(name, element)
+    inertial.refuse_near_miss("origin", "mass", "inertia")
+    weight, inertia = inertial.require("mass", "value"), inertial.require("inertia", *INERTIA)
+    mass = weight.number("value")
+    if mass < 0.0:
+        raise weight.error(f"{weight.title} is {mass:g} kg, expected 0 or more; correct it")
+    return Link(name, element, mass, read_pose(inertial), tuple(map(inertia.number, INERTIA)))
+
+
+def read_pose(element: Element) -> Pose:
+    """Read the <origin> of an element, or return the identity without one."""
+    origin = element.find("origin", "xyz", "rpy", "quat_xyzw")
+    if origin is None:
+        return Pose()
+    given = origin.attributes
+    xyz, rpy = (
+        origin.vector(name, 3) if name in given else (0.0, 0.0, 0.0) for name in ("xyz", "rpy")
+    )
+    if (longest := max(map(abs, xyz))) > _FARTHEST:
+        raise origin.error(
+            f"xyz of {origin.title} has an entry of {longest:g} m, expected at most "
+            f"{_FARTHEST:g} m; correct it"
+        )
+    if "quat_xyzw" not in given:
+        return Pose(xyz, rpy)
+    if "rpy" in given:
+        raise origin.error(f"{origin.title} has both rpy and quat_xyzw; keep one of them")
+    quaternion = origin.vector("quat_xyzw", 4)
+    length = float(np.hypot.reduce(quaternion))
+    if not abs(length - 1.0) <= _QUATERNION_SLACK:
+        raise origin.error(
+            f"quat_xyzw of {origin.title} has length {length:g}, expected 1; normalise it"
+        )
+    return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
+
+
+def read_joint(element: Element) -> JointElement:
+    """Read a <joint>, or raise `UrdfError` if it is invalid."""
+    name, of = element.text("name"), element.title
+    kind = element.text("type")
+    if kind not in FREEDOM:
+        raise element.error(f"{of} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}")
+    element.refuse_near_miss("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
+    for child in element.children:
+        if child.tag.endswith(":mimic"):
+            raise child.error(f"<{child.tag}> in {of} is not known to URDF; write it as <mimic>")
+    parent, below = (element.require(end, "link").text("link") for end in ("parent", "child"))
+    mimic = None
+    if found := element.find("mimic", "joint", "multiplier", "offset"):
+        numbers = found.number("multiplier", 1.0), found.number("offset", 0.0)
+        mimic = Mimic(found.text("joint"), *numbers)
+    joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
+    # Fixed joints need no axis, and exporters write zeros for it.
+    if FREEDOM[kind] != 1:
+        return joint
+    if found := element.find("axis", "xyz"):
+        joint = joint._replace(axis=found.vector("xyz", 3))
+        length = math.hypot(*joint.axis)
+        if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
+            raise found.error(
+                f"{found.title} has length {length:g}; expected a direction, such as 0 0 1"
+            )
+    if found := element.find("dynamics", "damping", "friction"):
+        damping, friction = (found.number(x, 0.0) for x in ("damping", "friction"))
+        if min(damping, friction) < 0.0:
+            raise found.error(
+                f"damping {damping:g} and friction {friction:g} of {of}: expected 0 or more; "
+                "correct the negative value"
+            )
+        joint = joint._replace(damping=damping, friction=friction)
+    if found := element.find("limit"):
+        joint = joint._replace(limits=_limits(found))
+    return joint
+
+
+def _limits(found: Element) -> dict[str, float]:
+    """Return the valid limits; others cause only a note, because models do not depend on limits."""
+    limits: dict[str, float] = {}
+    for name in ("lower", "upper", "effort", "velocity"):
+        if name not in found.attributes:
+            continue
+        value = decimal(found.attributes[name].strip())
+        if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
+            found.note(
+                f"limit {name} of {found.owner} is {quoted(found.attributes[name])}, expected a "
+                "number (0 or more for effort and velocity); the limit is ignored"
+            )
+            value = -math.inf if name == "lower" else math.inf
+        limits[name] = max(-UNLIMITED, min(value, UNLIMITED))
+    lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
+    if lower > upper:
+        found.note(
+            f"lower limit {lower:g} of {found.owner} exceeds its upper limit {upper:g}; both "
+            "position limits are ignored"
+        )
+        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
+    return limits
+
+
+def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
+    """Return {mimic joint: Mimic of an independent joint}, without fixed joints."""
+    written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
+    resolved: dict[str, Mimic] = {}
+    for name in written:
+        chain = [name]
+        while (follower := chain[-1]) in written and follower not in resolved:
+            leader, element = written[follower].leader, joints[follower].element
+            if leader not in joints:
+                error = unknown("joint", leader[:60], [name[:60] for name in joints])
+                raise element.error(f"{element.title} mimics a joint that does not exist: {error}")
+            for each in (follower, leader):
+                if joints[each].freedom != 1:
+                    raise element.error(
+                        f"{element.title} mimics {quoted(leader)}, but {quoted(each)} is "
+                        f"{joints[each].type}; both joints must have one degree of freedom"
+                    )
+            if leader in chain:
+                loop = [*chain[chain.index(leader) :], leader]
+                raise element.error(
+                    f"the mimic joints {enumerated(loop)} form a loop; remove the <mimic> of one "
+                    "of them"
+                )
+            chain.append(leader)
+        for follower in reversed(chain[:-1]):
+            leader, multiplier, offset = written[follower]
+            above = resolved.get(leader, Mimic(leader, 1.0, 0.0))
+            resolved[follower] = Mimic(
+                above.leader, multiplier * above.multiplier, multiplier * above.offset + offset
+            )
+    return {name: resolved[name] for name in written}
+
+
+Part = TypeVar("Part", Link, JointElement)
+
+
+def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement], int]:
+    """Check the elements of a URDF, and return its links, its joints and the depth of their tree.
+
+    Both are in the order of the file. The depth is the number of links on the longest path.
+    """
+    if root.tag != "robot":
+        raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
+    root.refuse_near_miss("link", "joint")
+    # Extensions of URDF have elements with these names too, but with other children. So nested
+    # elements are recognised by their children.
+    marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
+    for child in root.children:
+        for inner in (child, *child.iterate()):
+            nested = inner.tag == "robot" or inner is not child
+            if nested and marks.get(inner.tag, {""}) <= {part.tag for part in inner.children}:
+                raise inner.error(
+                    f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
+                    f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
+                )
+    links = _by_name(read_link, root.find_all("link"))
+    if not 0 < len(links) <= _LINK_LIMIT:
+        raise root.error(
+            "<robot> has no <link>; add one"
+            if not links
+            else f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links "
+            "that are fixed to each other"
+        )
+    joints = _by_name(read_joint, root.find_all("joint"))
+    return links, joints, _depth(root, links, joints)
+
+
+def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[str, Part]:
+    parts: dict[str, Part] = {}
+    for element in elements:
+        part = read(element)
+        earlier = parts.setdefault(part.name, part)
+        if earlier is not part:
+            raise element.error(
+                f"a second {element.tag} has the name {quoted(part.name)}, which is already used "
+                f"in line {earlier.element.line}; rename one of them"
+            )
+    return parts
+
+
+def _depth(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> int:
+    """Check that the joints connect the links into one tree; return the tree's depth in links."""
+    above: dict[str, JointElement] = {}
+    children: dict[str, list[str]] = {}
+    for joint in joints.values():
+        of = joint.element.title
+        for end, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                error = unknown("link", name[:60], [link[:60] for link in links])
+                raise joint.element.error(f"the {end} of {of} does not exist: {error}")
+        if other := above.get(joint.child):
+            raise joint.element.error(
+                f"link {quoted(joint.child)} is the child of {of} and of {other.element.title} in "
+                f"line {other.element.line}; a link can have only one parent, because URDF has no "
+                "closed loops; remove one of these joints"
+            )
+        above[joint.child] = joint
+        children.setdefault(joint.parent, []).append(joint.child)
+    roots = [name for name in links if name not in above]
+    if len(roots) > 1:
+        raise links[roots[1]].element.error(
+            f"the links form {len(roots)} separate trees, with roots {enumerated(roots)}; connect "
+            "them by joints"
+        )
+    depth, level = 0, roots
+    while level:
+        depth += 1
+        for name in level:
+            above.pop(name, None)
+        level = [child for name in level for child in children.get(name, ())]
+    for joint in above.values():  # no path leads from the root to these joints
+        raise joint.element.error(
+            f"{named('joint', [each.name for each in above.values()])} form a closed loop without "
+            "a root; correct a parent or child in it"
+        )
+    if depth > _DEPTH_LIMIT:
+        raise root.error(
+            f"the tree is {depth} links deep, expected at most {_DEPTH_LIMIT}; merge links that "
+            "are fixed to each other"
+        )
+    return depth
+
+
+def is_impossible(mass: float, moments: Sequence[float]) -> bool:
+    """Return whether any of the sorted principal moments [kg m^2] is negative beyond rounding."""
+    # A body within the radius r of its centre has moments of at most mass r^2.
+    return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
+
+
+def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
+    """Return notes about unusual inertias.
+
+    Raise an error for a negative moment that is not negligible beside the fixed links.
+    """
+    unequal, weightless, negligible = [], [], []
+    for link in links:
+        least, middle, largest = np.linalg.eigvalsh(link.tensor).tolist()
+        if is_impossible(link.mass or 0.0, (least, middle, largest)):
+            joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
+            of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]
+            if abs(least) > _LOST_IN_BODY * of_body:
+                raise link.element.error(
+                    f"the inertia of {link.element.title} has principal moments {least:.3g}, "
+                    f"{middle:.3g}, {largest:.3g} kg m^2, expected 0 or more; correct ixx ... izz"
+                )
+            negligible.append(link.name)
+        elif largest - middle - least > TRIANGLE_SLACK * abs(largest):
+            unequal.append(link.name)
+        if not link.mass and any(link.inertia):
+            weightless.append(link.name)
+    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
+    notes = (
+        (negligible, f"{lost}negligible compared with the links it is fixed to"),
+        # Note a principal moment that is larger than the sum of the other two.
+        (unequal, f"unphysical inertia: {enumerated(unequal)}"),
+        (weightless, f"inertia without mass: {named('link', weightless)}"),
+    )
+    return [f"{origin}: {text}" for names, text in notes if names]
