@@ -19,8 +19,7 @@ from fflin.control.optimal.differential_riccati import Coefficients, imbalance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
-from fflin.linear.flow import cubic
-from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory import Trajectory, cubic
 from fflin.robot.robot import Robot
 
 _nothing = partial(np.zeros, 0)

@@ -100,7 +100,7 @@ class TrajectoryFeedback(Feedback):
         if t > over:
             return self.end.q, self.end.v, self.end.u0
         first, last = self.trajectory.t[[0, -1]].tolist()
-        return self.trajectory.flow.at(min(first + max(t, 0.0), last))
+        return self.trajectory.point(min(first + max(t, 0.0), last))
 
     @property
     def over(self) -> float:
@@ -300,7 +300,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
                 "expected the same sample= and the same trajectory for both"
             )
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Loop:
         """Return policy(t, q, v) -> u for a robot; each call returns one with its own estimate.
 
         Raises

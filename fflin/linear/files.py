@@ -1,9 +1,9 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
-The csv files of a model are tables for other programs, and fflin does not read them: one table for
-each matrix, with names of rows and columns; one each for the states, inputs and outputs; and the
-table ``info`` of all other entries. In a trajectory in csv, every row of the last column repeats
-the digest of the other columns. So the file has no extra lines, and other programs can read the
+A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
+each for the states, inputs and outputs; and the table ``info`` of all other entries, whose last
+line is the digest of all tables. In a trajectory in csv, every row of the last column repeats the
+digest of the other columns. So the file has no extra lines, and other programs can read the
 columns by their names.
 """
 
@@ -61,6 +61,9 @@ _LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
+_MATRICES = [key for key, of in _ARRAYS.items() if len(of) == 2]
+_TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
+
 T = TypeVar("T")
 
 
@@ -88,15 +91,17 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
         record.write_record(path, entries, checksummed=checksummed)
         return
     record.require_finite(entries)
-    write_atomically(
-        {_csv_path(path, key): csv_table(rows) for key, rows in _tables(entries).items()}
-    )
+    contents = {key: csv_table(rows) for key, rows in _tables(entries).items()}
+    if checksummed:
+        contents["info"] += f"{record.CHECKSUM},{record.content_digest(contents)}\n".encode()
+    write_atomically({_csv_path(path, key): content for key, content in contents.items()})
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
     """Return the fields of a model, and its certificate; see `LinearModel.load`."""
+    check_ending(path, FORMATS)
     with reading(path, "linear model"):
-        entries, verified = read_record(path)
+        entries, verified = _from_csv(path) if path.suffix == ".csv" else read_record(path)
         fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
         fields |= {key: text(entries[key]) for key in _TEXTS}
         fields |= {key: figure(entries[key]) for key in _FIGURES}
@@ -155,20 +160,53 @@ def _tables(entries: Record) -> dict[str, list[list[object]]]:
             tables[key] = [["", *names[of[1]]], *([name, *row] for name, row in body)]
         elif of[0] not in _SIGNALS:
             info |= {f"{key}[{i}]": value for i, value in enumerate(values)}
-    return tables | {"info": [["name", "value"], *map(list, info.items())]}
+    tables["info"] = [["name", "value"], *map(list, info.items())]
+    return {key: tables[key] for key in _TABLES}
+
+
+def _from_csv(path: Path) -> tuple[Record, bool]:
+    """Return the entries of a model in csv, and whether their digest was verified."""
+    if not _csv_path(path, "info").exists() and path.exists():
+        raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
+    contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
+    body, mark, checksum = contents["info"].rpartition(f"\n{record.CHECKSUM},".encode())
+    if mark:
+        contents["info"] = body + b"\n"
+        if checksum != f"{record.content_digest(contents)}\n".encode():
+            raise ValueError(
+                f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
+            )
+    entries: Record = {key: [] for key in _ARRAYS} | {"certificate": {}}
+    for key, content in contents.items():
+        header, *rows = list(csv.reader(io.StringIO(content.decode(), newline=""))) or [[]]
+        if key in _MATRICES:
+            entries[key] = [row[1:] for row in rows]
+            continue
+        if key != "info":
+            columns = list(zip(*rows, strict=True)) or [()] * len(header)
+            of = (f"{key[:-1]}_names", f"{key[:-1]}_units", *header[2:])
+            entries |= zip(of, columns, strict=False)
+            continue
+        for name, value in rows:
+            of_array, bracket, _ = name.partition("[")
+            _, dot, of_certificate = name.partition(".")
+            if bracket:
+                entries[of_array].append(value)
+            elif dot:
+                entries["certificate"][of_certificate] = value
+            elif name in _LISTS:
+                entries[name] = [each for each in value.split(";") if each]
+            else:
+                entries[name] = value
+    return entries, bool(mark)
 
 
 def foreign_table(path: Path) -> Path | None:
     """Return a file that saving NAME.csv would overwrite and that no model wrote, or None."""
     info = _csv_path(path, "info")
-    if info.is_file() and b"\nurdf_sha256," in info.read_bytes():
-        return None
-    matrices = [key for key, of in _ARRAYS.items() if len(of) == 2]
-    for key in (*matrices, *(f"{signal}s" for signal in _SIGNALS), "info"):
-        table = _csv_path(path, key)
-        if table.is_file() and table.stat().st_size:
-            return table
-    return None
+    own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
+    tables = [] if own else [_csv_path(path, key) for key in _TABLES]
+    return next((table for table in tables if table.is_file() and table.stat().st_size), None)
 
 
 def _csv_path(path: Path, key: str) -> Path:

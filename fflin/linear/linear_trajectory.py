@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -15,12 +15,10 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
-from fflin.linear.flow import interval_of
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory import Trajectory, intervals_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -79,7 +77,7 @@ class LinearTrajectory(Trajectory):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.state_names != self._state.names:
+        if self.state_names != self._aba.state.names:
             raise InputError(
                 f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
                 "states differ; give the robot for which the trajectory was made"
@@ -88,7 +86,7 @@ class LinearTrajectory(Trajectory):
     @property
     def input_units(self) -> tuple[str, ...]:
         """Units of the nu inputs."""
-        return Actuation(self._state).units
+        return self.actuation.units
 
     def __len__(self) -> int:
         return len(self.A)
@@ -117,13 +115,12 @@ class LinearTrajectory(Trajectory):
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
-        placements = [interval_of(self.t, t) for t in times.tolist()]
-        sampled = bool(self.dt)
-        knot = np.array([k + (s == 1.0 and not sampled) for k, s in placements])
-        inside = np.array([0.0 < s < 1.0 and not sampled for _, s in placements])
+        k, s = intervals_of(self.t, times)
+        s = s * (not self.dt)
+        inside, knot = (s > 0.0) & (s < 1.0), k + (s == 1.0)
         A, B = self.A[knot], self.B[knot]
         if inside.any():
-            found = self._linearizer.along(*self.flow.points(times[inside]))
+            found = self._linearizer.along(*self.points(times[inside]))
             A[inside], B[inside] = found["A"], found["B"]
         return A, B
 
@@ -132,7 +129,7 @@ class LinearTrajectory(Trajectory):
 
         If the model is in discrete time, the values at the previous knot are returned instead.
         """
-        k, fraction = interval_of(self.t, self._within(t))
+        (k,), (fraction,) = intervals_of(self.t, np.array([self._within(t)]))
         if self.dt or not fraction:
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
@@ -246,10 +243,14 @@ def linearize_trajectory(
 def along(motion: Trajectory) -> LinearTrajectory:
     """Return the linear models along a motion."""
     linearizer = Linearizer(motion.robot, moving=True)
-    found: dict[str, Any] = motion._given | linearizer.along(motion.q, motion.v, motion.u_base)
-    names = ("state_names", "input_names", "output_names")
-    made = LinearTrajectory(**found, **{key: linearizer.prepared.common[key] for key in names})
-    object.__setattr__(made, "flow", motion.flow)  # keep cached results of the same motion
+    found: dict[str, Any] = {item.name: getattr(motion, item.name) for item in fields(Trajectory)}
+    found |= linearizer.along(motion.q, motion.v, motion.u_base)
+    for key in ("state_names", "input_names", "output_names"):
+        found[key] = linearizer.prepared.common[key]
+    made = LinearTrajectory(**found)
+    for name in ("interval_errors", "cubics"):
+        if name in vars(motion):  # keep cached results of the same motion
+            vars(made)[name] = vars(motion)[name]
     return made
 
 
@@ -285,24 +286,19 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
         cuts.append(np.array([start, *inner, end]))
     for first in range(0, len(cuts), _BATCH):
         batch = cuts[first : first + _BATCH]
-        found = _through(traj, batch, 1)
-        pending, parts = list(range(len(batch))), 1
+        found, parts, pending = _through(traj, batch, 1), 1, list(range(len(batch)))
         while pending and parts < _MOST_PARTS:
-            parts *= 2
-            finer = _through(traj, [batch[k] for k in pending], parts)
-            coarse = [found[k][1] for k in pending]
-            for k, each in zip(pending, finer, strict=True):
+            parts, coarse = 2 * parts, pending
+            finer = _through(traj, [batch[k] for k in coarse], parts)
+            pending = []
+            for k, each in zip(coarse, finer, strict=True):
+                # Half steps reduce the error 16 times. The estimate assumes only 4 times, to be on
+                # the safe side.
+                apart = np.abs(each[1] - found[k][1]).max(axis=0)
+                if not (0.25 * apart <= _ACCURACY * np.abs(each[1]).max(axis=0)).all():
+                    pending.append(k)
                 found[k] = each
-            pairs = zip(pending, coarse, strict=True)
-            pending = [k for k, before in pairs if not _agree(found[k][1], before)]
         yield from found
-
-
-def _agree(whole: Array, coarse: Array) -> bool:
-    # Half steps reduce the error 16 times. The estimate assumes only 4 times, to be on the safe
-    # side.
-    apart, size = (np.abs(each).max(axis=0) for each in (whole - coarse, whole))
-    return bool((0.25 * apart <= _ACCURACY * size).all())
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:

@@ -405,7 +405,7 @@ class LinearModel(StateSpace):
         ----------
         path : str or Path
             Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to a
-            separate file, such as NAME.A.csv, for other programs; `load` does not read these files.
+            separate file, such as NAME.A.csv.
 
         Raises
         ------

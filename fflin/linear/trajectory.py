@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.record import Design, record_of, write_record
+from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, as_double, frozen, number, vector
+from fflin.base.validation import Array, Indices, as_double, frozen, number, shaped, vector
 from fflin.base.writing import as_path
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.coordinates import refuse_orbit
+from fflin.dynamics.coordinates import frame_of, refuse_orbit
+from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import StateMap
-from fflin.linear.flow import Flow
+from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin import Motion
 
 # Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
@@ -33,6 +41,17 @@ _CAUSES = (
     "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
     "or springs, damping or gravity that differ from the robot"
 )
+
+# Steps are halved until the end of an interval has this accuracy, relative to the largest rates.
+# There are at most _MOST_STEPS steps.
+_ACCURACY, _MOST_STEPS = 1e-8, 128
+
+# Rounding errors of positions, and of accelerations relative to the summed terms.
+_EPS = float(np.finfo(float).eps)
+_POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
+
+# A time that is less than this fraction of an interval away from a knot counts as the knot.
+_NEAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,11 +119,11 @@ class Trajectory(Design):
 
     def __post_init__(self) -> None:
         refuse_orbit(self.robot, "trajectories")
-        robot, nu = self.robot, len(Actuation(self._state).names)
-        times = as_double("t", self.t)
-        times = vector("t", times, times.size, "times of the knots")
-        if len(times) < 2:
-            raise InputError(f"t has {len(times)} times, expected at least 2, in increasing order")
+        robot, nu = self.robot, len(self.actuation.names)
+        times = vector("t", as_double("t", self.t), np.size(self.t), "times of the knots")
+        count = len(times)
+        if count < 2:
+            raise InputError(f"t has {count} times, expected at least 2, in increasing order")
         if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
             late, early = times[back[0] : back[0] + 2]
             raise InputError(
@@ -112,26 +131,19 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        count, u = len(times), as_double("u", self.u)
-        short = u.shape == (count - 1, nu) and self.hold != "linear"
-        if not short and u.shape != (count, nu):
-            expected = f"({count}, {nu}), or ({count - 1}, {nu}) if each row acts over an interval"
-            raise InputError(f"u has shape {u.shape}, expected {expected}")
-        v = as_double("v", self.v)
-        if v.shape != (count, robot.nv):
-            raise InputError(f"v has shape {v.shape}, expected ({count}, {robot.nv})")
-        rows: dict[str, list[Array]] = {"q": [], "v": [], "u": []}
-        u = np.vstack((u, u[-1:])) if short else u
-        for t, *row in zip(times, _configurations(robot, self.q, count), v, u, strict=True):
+        short = np.shape(self.u) == (count - 1, nu) and self.hold != "linear"
+        hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
+        u = shaped("u", self.u, (count - short, nu), hint)
+        q, v = _configurations(robot, self.q, count), shaped("v", self.v, (count, robot.nv))
+        for k, t in enumerate(times):
             try:
-                rows["q"].append(robot.checked_configuration(row[0]))
-                rows["v"].append(robot.checked_velocity(row[1]))
-                require_slow("v", rows["v"][-1])
-                rows["u"].append(vector("u", row[2], nu, "the robot's inputs"))
+                q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
+                require_slow("v", v[k])
             except FflinError as error:
                 raise InputError(f"at t = {t:g} s: {error}") from None
-        values: dict[str, object] = {name: frozen(np.array(each)) for name, each in rows.items()}
-        values |= {"t": times, "hold": self.hold or ("previous" if short else "linear")}
+        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v)}
+        values["u"] = frozen(np.vstack((u, u[-1:])) if short else u)
+        values["hold"] = self.hold or ("previous" if short else "linear")
         for name, value in values.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -148,21 +160,23 @@ class Trajectory(Design):
         note = f"\n{folded(self._note.splitlines())}" if self._note else ""
         return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
 
-    @property
-    def _state(self) -> StateMap:
-        axes: Any = self.frame
-        return StateMap(self.robot, frame=axes)
-
     @cached_property
-    def flow(self) -> Flow:
-        """Interpolation of the motion between the knots."""
-        return Flow(self._state, self.t, self.q, self.v, self.u, self.hold == "previous")
+    def _aba(self) -> Aba:
+        return Aba(StateMap(self.robot, frame=frame_of(self.robot, self.frame)))
+
+    @property
+    def actuation(self) -> Actuation:
+        """Inputs of the robot, with the force and torque on the base in the axes of `frame`."""
+        return self._aba.actuation
 
     @cached_property
     def u_base(self) -> Array:
         """Inputs (N, nu) just after each knot, with inputs on the base in base axes."""
-        state = self._state
-        return frozen(Actuation(state).in_base_axes(state.charts(self.q), self.u))
+        return frozen(self._in_base_axes(self.q, self.u))
+
+    def _in_base_axes(self, q: Array, u: Array) -> Array:
+        charts = self._aba.state.charts
+        return self.actuation.in_base_axes(charts(q), u) if self.actuation.held else u
 
     @property
     def residual(self) -> Array:
@@ -170,10 +184,10 @@ class Trajectory(Design):
 
         In each interval, the dynamics are integrated from the first knot under the given inputs.
         The error of the interval is the difference between the integrated state and the second
-        knot, divided by the duration of the interval and by the largest rate of the motion; see
-        `Flow`. The residual of a knot is the larger error of its two adjacent intervals.
+        knot, divided by the duration of the interval and by the largest rate of the motion. The
+        residual of a knot is the larger error of its two adjacent intervals.
         """
-        found = self.flow.residual
+        found = self.interval_errors
         return np.maximum(np.append(found, 0.0), np.append(0.0, found))
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
@@ -187,7 +201,22 @@ class Trajectory(Design):
         InputError
             If the time is before the first or after the last knot.
         """
-        return self.flow.at(self._within(t))
+        q, v, u = self.points(np.array([self._within(t)]))
+        return q[0], v[0], u[0]
+
+    def points(self, times: Array) -> tuple[Array, Array, Array]:
+        """Return q, v and u (k, ..) at times (k,); see `point`."""
+        k, s = intervals_of(self.t, times)
+        powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
+        steps = np.einsum("ij,ijk->ik", powers, turns[k])
+        q = integrate_rows(self.robot.model, self.q[k], steps)
+        u = self._in_base_axes(q, self._input(k, s[:, None]))
+        return q, np.einsum("ij,ijk->ik", powers, speeds[k]), u
+
+    def _input(self, k: int | Indices, fraction: float | Array) -> Array:
+        """Return the inputs in the axes of `frame`, at a fraction of the intervals k."""
+        u: Array = self.u[k]
+        return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
 
     def resampled(self, dt: float) -> Trajectory:
         """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
@@ -197,10 +226,18 @@ class Trajectory(Design):
         times = self.samples(dt)
         if times[-1] < self.t[-1]:
             times = np.append(times, self.t[-1])
-        q, v, _ = self.flow.points(times)
-        u = np.array([self.flow.input(t) for t in times])
-        kept = {"hold": self.hold, "frame": self.frame, "verified": self.verified}
-        return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
+        q, v, _ = self.points(times)
+        k, s = intervals_of(self.t, times)
+        return Trajectory(
+            self.robot,
+            times,
+            q,
+            v,
+            self._input(k, s[:, None]),
+            hold=self.hold,
+            frame=self.frame,
+            verified=self.verified,
+        )
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""
@@ -222,7 +259,7 @@ class Trajectory(Design):
         without `strict`.
         """
         fault = self._fault
-        if fault and (strict or self.flow.residual.max() == np.inf):
+        if fault and (strict or self.interval_errors.max() == np.inf):
             raise InputError(fault)
         if fault:
             warnings.warn(fault, FflinWarning, stacklevel=3)
@@ -230,7 +267,7 @@ class Trajectory(Design):
     @property
     def _fault(self) -> str:
         """Return why the knots are not a motion of the robot, or an empty text."""
-        missed = self.flow.residual
+        missed = self.interval_errors
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
         if missed[k] > _MOTION:
@@ -260,7 +297,7 @@ class Trajectory(Design):
         if type(self) is Trajectory and target.suffix == ".csv":
             write_csv(target, self)
         elif type(self) is Trajectory:
-            record = record_of(self) | {"input_names": list(Actuation(self._state).names)}
+            record = record_of(self) | {"input_names": list(self.actuation.names)}
             write_record(target, record, checksummed=self.verified)
         else:
             super().save(target)
@@ -318,9 +355,99 @@ class Trajectory(Design):
             )
         return t
 
-    @property
-    def _given(self) -> dict[str, Any]:
-        return {item.name: getattr(self, item.name) for item in fields(Trajectory)}
+    @cached_property
+    def interval_errors(self) -> Array:
+        """Relative error (N - 1,) of each interval, integrated from its first knot; see `residual`.
+
+        The error is infinite if the integration overflows.
+        """
+        # Rates are relative to an observer who moves at the base's median velocity (Galilean
+        # invariance), and each rotor has its own scale. So neither a high orbital velocity nor a
+        # fast wheel hides an error.
+        t, u, state = self.t, self.u, self._aba.state
+        rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
+        velocities = (rotations @ v[:, :3, None])[..., 0]
+        usual = np.median(velocities, axis=0)
+        flown = np.outer(t - t[0], usual)
+        farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
+        digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
+        digits[:3] = _POSITION_ROUNDING * max(
+            float(np.abs(x).max()) for x in (q[:, :3], flown, velocities)
+        )
+        q[:, :3] -= q[0, :3] + flown
+        v[:, :3] -= usual @ rotations
+        rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
+        terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
+        # The largest magnitudes; infinite or NaN entries count as zero.
+        push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
+        rotors = rotor_names(state.robot)
+        alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
+        others = sorted({*range(6, len(digits))} - {*alone})
+        speed = np.abs(v).max(axis=0)
+        for group in ([0, 1, 2], [3, 4, 5], *([each] for each in alone), others):
+            for x in (speed, push):
+                x[group] = x[group].max(initial=0.0) or 1.0
+
+        def size(of_q: Array, of_v: Array, h: float) -> float:
+            miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)
+            jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
+            return float(np.maximum(miss, jump).max())
+
+        found, steps, model = [], 1, self.robot.model
+        # If the knots are not a motion of the robot, the integration may diverge. The residual
+        # shows it.
+        with np.errstate(all="ignore"):
+            for k, h in enumerate(np.diff(t).tolist()):
+                steps = max(1, steps // 4)
+                end = self.end(k, steps, q[k], v[k])
+                while steps < _MOST_STEPS:
+                    before, steps = end, 2 * steps
+                    end = self.end(k, steps, q[k], v[k])
+                    apart = pin.difference(model, before[0], end[0])
+                    change = size(apart, end[1] - before[1], h)
+                    if change <= _ACCURACY or not np.isfinite(change):
+                        break
+                found.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def end(
+        self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
+    ) -> tuple[Array, Array]:
+        """Integrate by CF4 (11.1) over part of an interval, by default all of it; return q, v."""
+        start, h = self.t[k], self.t[k + 1] - self.t[k]
+        method = CommutatorFree4(self.robot.model, (over[1] - over[0]) * h / steps)
+
+        def rate(t: float, q: Array, v: Array) -> Array:
+            u = self._in_base_axes(q, self._input(k, (t - start) / h))
+            return self._aba.acceleration(q, v, u).copy()
+
+        for step in range(steps):
+            q, v = method.step(rate, start + over[0] * h + step * method.dt, q, v)
+        return q, v
+
+    @cached_property
+    def cubics(self) -> tuple[Array, Array]:
+        """Coefficients (N - 1, 4, nv) of v and of the displacement from each interval's start."""
+        q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
+        begin = self._aba.accelerations(q, v, self.u_base)
+        end = begin[1:]
+        if self.hold == "previous":
+            u = self._in_base_axes(q[1:], self.u[:-1])
+            end = self._aba.accelerations(q[1:], v[1:], u)
+        apart = np.array([pin.difference(model, *pair) for pair in pairwise(q)])
+        wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
+        # The knots give the angle of a wheel only up to full turns. The wheel's speed gives the
+        # number of turns.
+        turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
+        apart[:, wheels] += 2.0 * np.pi * np.round(turns)
+        slopes = [
+            pin.dDifference(model, *pair, pin.ArgumentPosition.ARG1) @ speed
+            for pair, speed in zip(pairwise(q), v[1:], strict=True)
+        ]
+        return (
+            cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes),
+            cubic(v[:-1], v[1:], h * begin[:-1], h * end),
+        )
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
@@ -340,7 +467,25 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     return wide
 
 
-def along(motion: Any, robot: Robot | None) -> Trajectory:
+def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
+    """Return the indices (k,) of the intervals that contain times (k,), and elapsed fractions."""
+    last = len(t) - 2
+    k = np.maximum(np.minimum(t.searchsorted(times, "right") - 1, last), 0)
+    fraction = (times - t[k]) / (t[k + 1] - t[k])
+    ends = (fraction > 1.0 - _NEAR) & (k < last)
+    fraction[ends | (fraction < _NEAR)] = 0.0
+    return k + ends, np.minimum(fraction, 1.0)
+
+
+def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
+    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from values and derivatives."""
+    apart = last - first
+    return np.stack(
+        (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
+    )
+
+
+def along(motion: Motion, robot: Robot | None) -> Trajectory:
     """Convert a motion to a trajectory with constant or linear inputs, whichever fits better."""
     if motion.phases:
         raise InputError(

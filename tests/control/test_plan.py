@@ -180,7 +180,7 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     for k in range(knots - 1):
         q, v = motion.q[k], motion.v[k]
         for part in range(parts):
-            q, v = motion.flow.end(k, 1, q, v, (part / parts, (part + 1) / parts))
+            q, v = motion.end(k, 1, q, v, (part / parts, (part + 1) / parts))
             largest = max(largest, abs(v[6]))
     assert 0.97 * limit < largest <= 1.01 * limit
     assert missed(robot, motion, goal) < 1e-6
@@ -201,7 +201,7 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
         r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split())
     )
     fine = [
-        motion.flow.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
+        motion.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
         for k in range(5)
         for part in range(1, 17)
     ]
@@ -388,7 +388,7 @@ def test_rows_of_motions_are_those_of_single_motions(servicer):
     assert np.abs(shooting.missed(q, v, shooting.motions(q, v, u))).max() < 1e-13
     motion = fflin.Trajectory(robot, shooting.t, q, v, u)
     for k in range(4):
-        end = motion.flow.end(k, 16, q[k], v[k])
+        end = motion.end(k, 16, q[k], v[k])
         assert np.abs(shooting.between((q[k + 1], v[k + 1]), end)).max() < 1e-13
 
 

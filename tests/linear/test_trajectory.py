@@ -11,7 +11,6 @@ import pytest
 from scipy.io import savemat
 
 import fflin
-from fflin.linear.flow import Flow
 from tests.support.messages import says
 from tests.support.motions import motion
 
@@ -117,7 +116,7 @@ def test_knots_that_are_no_motion_say_where_how_many_and_the_usual_causes():
     with pytest.warns(fflin.FflinWarning, match="and 2 of 80 intervals") as found:
         along = fflin.linearize_trajectory(robot, given)
     said = str(found[0].message)
-    k = int(given.flow.residual.argmax())
+    k = int(given.interval_errors.argmax())
     assert k in (39, 40) and f"from t = {t[k]:g} to {t[k + 1]:g} s" in said
     assert f"the error is {given.residual.max():.2g}" in said and "usual causes" in said
     assert said in " ".join(str(given).split()) and said in " ".join(str(along).split())
@@ -126,8 +125,9 @@ def test_knots_that_are_no_motion_say_where_how_many_and_the_usual_causes():
 def test_intervals_are_integrated_once(monkeypatch):
     robot = fflin.load("astrobee_arm")
     t, q, v, u = motion(robot)
-    given, ends, end = fflin.Trajectory(robot, t, q, v, 1.1 * u), [], Flow.end
-    monkeypatch.setattr(Flow, "end", lambda *each: ends.append(each[1]) or end(*each))
+    given, ends = fflin.Trajectory(robot, t, q, v, 1.1 * u), []
+    end = fflin.Trajectory.end
+    monkeypatch.setattr(fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each))
     with pytest.warns(fflin.FflinWarning, match="not a motion"):
         along = fflin.linearize_trajectory(robot, given)
     count = len(ends)
@@ -148,8 +148,8 @@ def test_what_overflows_is_refused_with_its_place(name, row, value, where, monke
     robot = fflin.load("astrobee_arm")
     given = dict(zip("tqvu", map(np.array, motion(robot)), strict=True))
     given[name][row if name == "t" else (row, 2)] = value
-    ends, end = [], Flow.end
-    monkeypatch.setattr(Flow, "end", lambda *each: ends.append(each[1]) or end(*each))
+    ends, end = [], fflin.Trajectory.end
+    monkeypatch.setattr(fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each))
     with pytest.raises(fflin.InputError, match=re.escape(where)):
         fflin.linearize_trajectory(robot, *given.values())
     # An interval that overflows is left at once.

@@ -9,6 +9,6 @@ def largest_speeds(motion, parts=64):
     for k in range(len(motion.t) - 1):
         q, v = motion.q[k], motion.v[k]
         for part in range(parts):
-            q, v = motion.flow.end(k, 1, q, v, (part / parts, (part + 1) / parts))
+            q, v = motion.end(k, 1, q, v, (part / parts, (part + 1) / parts))
             largest = np.maximum(largest, np.abs(v[6:]))
     return largest

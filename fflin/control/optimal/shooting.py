@@ -11,8 +11,8 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.state import StateMap
-from fflin.linear.flow import cubic
 from fflin.linear.linearization import Linearizer
+from fflin.linear.trajectory import cubic
 from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
