@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 import fflin
+from fflin.batch.run import Execution
 from fflin.campaign.settling import OUTCOMES, checked_loop, settle, settling_runs
 
 FRAMES = ("hybrid", "local", "world")
@@ -33,8 +34,8 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         x = (x - loop.start)[None]
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
-            runs_of = partial(settling_runs, there, False, None, 0.0)
-            arrays = settle(runs_of, lambda _, x=x: x, 1, "python")
+            runs_of = partial(settling_runs, there, False, None, 0.0, "python")
+            arrays = settle(runs_of, x, Execution())
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 

@@ -11,13 +11,14 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from fflin.base.errors import FileError, InputError, optional_package
@@ -129,17 +130,14 @@ def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
     """Return arrays, names of the arrays with one row for all points, strings, and `verified`."""
-    with path.open("rb") as file:
-        zipped = file.read(2) == b"PK"
-    if not zipped and path.suffix == ".npz":
-        raise ValueError("it is not a zip archive")
-    arrays, texts, verified = (_from_npz if zipped else _from_hdf5)(path, verify)
+    check_format(path)
+    arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)
     return arrays, json.loads(texts["constant"]), texts, verified
 
 
 def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
     # The file is opened here, because NumPy does not close a file that it finds damaged.
-    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+    with path.open("rb") as handle, NpzFile(handle, allow_pickle=False) as file:
         entries = {key: file[key] for key in file.files}
     verified = verify and verify_checksum(entries)
     entries.pop(CHECKSUM, None)
@@ -186,7 +184,9 @@ class MemoryStore:
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
                 raise MemoryError
-            self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
+            self.arrays: dict[str, Array] = {
+                key: np.empty((count, *shape)) for key, shape in shapes.items()
+            }
         except (MemoryError, ValueError):
             raise InputError(
                 f"{count:,} rows do not fit into memory; write them to a file with "
@@ -199,17 +199,21 @@ class MemoryStore:
 
     def read(self, stop: int) -> dict[str, Array]:
         """Return the rows before row `stop`."""
-        return self.view(0, stop)
+        return self.view(0, stop, self.arrays)
 
-    def view(self, start: int, stop: int) -> dict[str, Array]:
-        """Return views of the arrays for the rows of a chunk."""
-        return {key: value[start:stop] for key, value in self.arrays.items()}
+    def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
+        """Return arrays in which the results of a chunk are computed: views of the named arrays."""
+        return {key: self.arrays[key][start:stop] for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
         """Keep a finished chunk."""
-        for key, rows in self.view(start, stop).items():
+        for key, rows in self.view(start, stop, self.arrays).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
+
+    def complete(self) -> dict[str, Array]:
+        """Return all arrays."""
+        return self.arrays
 
     def close(self) -> None:
         """Do nothing, because memory needs no closing."""
@@ -231,7 +235,7 @@ class FileStore:
         texts: Mapping[str, str],
     ) -> None:
         self.path, self.part, self.count = path, part_of(path), count
-        self._names, self._constants, self._texts = tuple(shapes), constants, texts
+        self._shapes, self._constants, self._texts = shapes, constants, texts
         self.resumed = self.part.exists()
         with self._reported():
             if not self.resumed:
@@ -240,12 +244,12 @@ class FileStore:
             self._file = hdf5().File(self.part, "r+" if self.resumed else "w", libver=CHECKED)
         try:
             with self._reported():
-                self._begin(request, chunk, shapes)
+                self._begin(request, chunk)
         except BaseException:
             (self.close if self.resumed else self.discard)()
             raise
 
-    def _begin(self, request: str, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    def _begin(self, request: str, chunk: int) -> None:
         attributes, create = self._file.attrs, self._file.require_dataset
         if self.resumed and attributes.get("request") != request:
             raise FileError(
@@ -257,7 +261,7 @@ class FileStore:
             properties = hdf5().h5p.create(hdf5().h5p.DATASET_CREATE)
             properties.set_alloc_time(hdf5().h5d.ALLOC_TIME_EARLY)
             properties.set_fill_time(hdf5().h5d.FILL_TIME_NEVER)
-            for key, shape in shapes.items():
+            for key, shape in self._shapes.items():
                 whole = (self.count, *shape)
                 self._file.create_dataset(key, whole, np.float64, dcpl=properties)
         for key, value in self._constants.items():
@@ -286,29 +290,30 @@ class FileStore:
         with self._reported():
             kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
             return bool(kept.any()) and kept.tobytes() == chunk_checksum(
-                {key: self._file[key][start:stop] for key in self._names}
+                {key: self._file[key][start:stop] for key in self._shapes}
             )
 
     def read(self, stop: int) -> dict[str, Array]:
         """Return the rows before row `stop`."""
         with self._reported():
-            return {key: self._file[key][:stop] for key in self._names}
+            return {key: self._file[key][:stop] for key in self._shapes}
 
-    def view(self, start: int, stop: int) -> None:
-        """Return None: a chunk cannot be computed in place, so `write` copies it to the file."""
+    def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
+        """Return arrays in which the results of a chunk are computed; `write` copies them."""
+        return {key: np.empty((stop - start, *self._shapes[key])) for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
         """Keep a finished chunk."""
         with self._reported():
-            for key in self._names:
+            for key in self._shapes:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
-            checksum = chunk_checksum({key: arrays[key] for key in self._names})
+            checksum = chunk_checksum({key: arrays[key] for key in self._shapes})
             self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(checksum, np.uint8)
             self._file.flush()
 
-    def complete(self) -> None:
-        """Add the checksum of the whole file, and rename the file to its final name."""
+    def complete(self) -> dict[str, Array]:
+        """Add the checksum of the whole file, and return its arrays under its final name."""
         with self._reported():
             checksums = self._file[CHUNK_CHECKSUMS][:]
             self._file[CHECKSUM][:] = file_checksum(
@@ -316,6 +321,8 @@ class FileStore:
             )
             self._file.close()
             install(self.part, self.path)
+        # This call has just written the file, so its checksums are not verified.
+        return read_rows(self.path, verify=False)[0]
 
     def discard(self) -> None:
         """Close and delete the unfinished file."""

@@ -12,9 +12,9 @@ from fflin.base.errors import InputError, located
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance, vector
+from fflin.batch.configurations import column, positions
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr, near_boundary
 from fflin.control.optimal.riccati import half_size
 from fflin.control.policies import Feedback

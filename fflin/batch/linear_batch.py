@@ -15,8 +15,8 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
 from fflin.base.validation import Array, FrozenArrays, Indices, Mask, frozen, number, refuse_masked
 from fflin.base.writing import as_path
+from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
-from fflin.batch.rows import Column, away, positions, values
 from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel

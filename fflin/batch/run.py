@@ -1,32 +1,41 @@
 """Run a job on rows, chunk by chunk, into a store that may already contain chunks.
 
-Chunks run on threads of this process, or on the workers of an executor. The job defines the meaning
-of the rows and the results.
+Chunks run on threads of this process, on worker processes that the call starts, or on the workers
+of a given executor. The job defines the meaning of the rows and the results.
 """
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
+    BrokenExecutor,
     Executor,
     Future,
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+from threading import Lock, Thread, local
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
 from fflin.base.validation import Array, Mask, whole
 from fflin.batch.files import FileStore, MemoryStore
-from fflin.batch.workers import NoWorkers, OwnWorkers, WorkerDied
+from fflin.kernel.compiled import available_cores
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
 
 # Chunks submitted per worker at a time, so that a worker never waits for its next chunk.
 _QUEUED = 2
@@ -34,131 +43,218 @@ _QUEUED = 2
 # Number of workers assumed if an executor does not report it.
 _UNKNOWN_WORKERS = 16
 
-Progress = Callable[[int, int], object]
+# Time for a terminated process to end before it is killed [s].
+_PATIENCE = 5.0
+
+Progress: TypeAlias = Callable[[int, int], object]
+
+# Named arrays of equal length, and a function that returns the rows from start to stop - 1.
+Rows: TypeAlias = Mapping[str, Array]
+RowsOf: TypeAlias = Callable[[int, int], Rows]
+
+# First and last row + 1 of a chunk, the arrays of its result with its warnings, and the chunk with
+# the reason why it failed.
+Span: TypeAlias = tuple[int, int]
+Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
+Failed: TypeAlias = tuple[int, int, str]
 
 
-class Rows(Protocol):
-    """Arrays of equal length in a named tuple."""
-
-    def _asdict(self) -> dict[str, Any]: ...
-
-
-R_contra = TypeVar("R_contra", bound=Rows, contravariant=True)
-
-
-class Span(NamedTuple):
-    """Rows of a chunk, from start to stop - 1."""
-
-    start: int
-    stop: int
-
-
-class ChunkResult(NamedTuple):
-    """Result of a chunk: its arrays by name, and its warnings."""
-
-    arrays: dict[str, Array]
-    notes: list[str]
-
-
-class Job(Protocol[R_contra]):
+class Job(Protocol):
     """Computation on rows; it is pickled, and each worker unpickles it once."""
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shape per row of each array that the job returns."""
+        """Shape per row of each array of the result."""
 
-    def run(
-        self, rows: R_contra, start: int, out: Mapping[str, Array] | None = None, /
-    ) -> ChunkResult:
-        """Process the rows from `start` on into `out` or new arrays; may run on any thread."""
+    @property
+    def threaded(self) -> bool:
+        """Whether threads of this process can compute chunks in parallel."""
 
-
-class Done(NamedTuple):
-    """Finished chunk: its result, or the reason why it failed."""
-
-    span: Span
-    result: ChunkResult | None
-    reason: str
+    def run(self, rows: Rows, start: int, out: Mapping[str, Array], /) -> list[str]:
+        """Write the results of the rows from `start` on into `out`, and return warnings."""
 
 
-def check_workers(
-    executor: object, workers: object, threads: object, chunk: object, progress: object
-) -> None:
-    """Raise `InputError` if an option for the execution of the chunks is wrong."""
-    if executor is not None and workers is not None:
-        raise InputError("executor and workers are both given; give only one of them")
-    if executor is not None and not hasattr(executor, "submit"):
-        raise InputError(
-            f"executor has type {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
-    for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
-        if value is not None:
-            whole(name, value, 1)
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+class Execution:
+    """Where the chunks of a call run; a context that ends the worker processes of the call.
+
+    The arguments are those of `sweep`; each must be valid, or `InputError` is raised.
+    """
+
+    def __init__(
+        self,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        threads: int | None = None,
+        chunk: int | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        if executor is not None and workers is not None:
+            raise InputError("executor and workers are both given; give only one of them")
+        if executor is not None and not hasattr(executor, "submit"):
+            raise InputError(
+                f"executor has type {type(executor).__name__}, expected a "
+                "concurrent.futures.Executor"
+            )
+        for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
+            if value is not None:
+                whole(name, value, 1)
+        if progress is not None and not callable(progress):
+            raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+        self._own = None if workers is None else OwnWorkers(workers)
+        self.executor = self._own or executor
+        self._threads = threads or available_cores()
+
+    def __enter__(self) -> Execution:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._own:
+            self._own.shutdown()
+
+    def count(self, job: Job) -> int:
+        """Return the number of chunks of a job that are computed at the same time."""
+        if self.executor is None:
+            return self._threads if job.threaded else 1
+        for name in ("_max_workers", "num_workers"):
+            count = getattr(self.executor, name, None)
+            if isinstance(count, int) and count > 0:
+                return count
+        client = getattr(self.executor, "_client", None)
+        if client is not None and hasattr(client, "nthreads"):
+            return max(1, sum(client.nthreads().values()))
+        return _UNKNOWN_WORKERS
 
 
 def run_chunks(
-    job: Job[R_contra],
-    rows: Callable[[int, int], R_contra],
+    job: Job,
+    rows: RowsOf,
     store: FileStore | MemoryStore,
-    *,
-    executor: Executor | None = None,
-    threads: int = 1,
+    how: Execution,
     progress: Progress | None = None,
+    *,
     upto: int | None = None,
     all_needed: bool = False,
-) -> list[Done]:
+) -> list[Failed]:
     """Compute the missing chunks of a store, save the results, and return failed chunks."""
-    # `rows(start, stop)` returns a named tuple; the store saves the fields for which it has arrays.
-    # Only chunks that begin before `upto` are computed. Without an executor, the chunks run on
-    # `threads` threads of this process. If all chunks are needed, the run ends at the first
-    # failure.
-    size = store.chunk
-    spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
-    left = [span for span in spans if not store.finished(*span)]
-    count = store.count - sum(stop - start for start, stop in left)
-    left = [span for span in left if upto is None or span.start < upto]
-    if progress and count:
-        progress(count, store.count)
-    failed: list[Done] = []
-    notes: list[str] = []
-    for done in (
-        _run_here(job, rows, store, left, threads)
-        if executor is None
-        else _run_on_workers(job, rows, left, executor)
-    ):
-        if done.result is None:
-            failed.append(done)
+    # The store saves the rows and results for which it has arrays. Only chunks that begin before
+    # `upto` are computed. If all chunks are needed, the run ends at the first failure.
+    left, done = list[Span](), 0
+    for start in range(0, store.count, store.chunk):
+        stop = min(start + store.chunk, store.count)
+        if store.finished(start, stop):
+            done += stop - start
+        elif upto is None or start < upto:
+            left.append((start, stop))
+    if progress and done:
+        progress(done, store.count)
+    failed, notes = list[Failed](), list[str]()
+    for (start, stop), result in _results(job, rows, store, left, how):
+        if isinstance(result, str):
+            failed.append((start, stop, result))
             if all_needed:
                 break
         else:
-            store.write(*done.span, {**rows(*done.span)._asdict(), **done.result.arrays})
-            notes += done.result.notes
-        count += done.span.stop - done.span.start
+            store.write(start, stop, {**rows(start, stop), **result[0]})
+            notes += result[1]
+        done += stop - start
         if progress:
-            progress(count, store.count)
+            progress(done, store.count)
     if notes:
         more = f" (and {len(notes) - 1} more such warnings)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
     return sorted(failed)
 
 
+def _results(
+    job: Job, rows: RowsOf, store: FileStore | MemoryStore, spans: list[Span], how: Execution
+) -> Iterator[tuple[Span, Result | str]]:
+    """Yield each chunk with its result, or with the reason why it failed."""
+
+    def here(start: int, stop: int) -> Result | str:
+        out = store.view(start, stop, job.shapes)
+        try:
+            return out, job.run(rows(start, stop), start, out)
+        except FflinError as error:
+            return str(error)
+
+    count, inside = how.count(job), how.executor is None
+    if inside and (count == 1 or len(spans) == 1):
+        for span in spans:
+            yield span, here(*span)
+        return
+    pool = how.executor or ThreadPoolExecutor(count)
+    pickled = b"" if inside else pickle.dumps(job)
+
+    def submit(start: int, stop: int) -> Future[Result | str]:
+        if inside:
+            return pool.submit(here, start, stop)
+        return pool.submit(work, pickled, rows(start, stop), start, stop)
+
+    waiting, running = deque(spans), dict[Future[Result | str], Span]()
+    try:
+        while waiting or running:
+            # Results wait in memory until they are consumed, so their number is limited.
+            while waiting and len(running) < _QUEUED * count:
+                span = waiting.popleft()
+                try:
+                    running[submit(*span)] = span
+                except Exception as error:  # broken, shut down, or specific to the executor
+                    yield span, _reason(error)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                span = running.pop(future)
+                try:
+                    result = future.result()
+                except Exception as error:  # each executor raises its own types
+                    if inside:
+                        raise
+                    result = _reason(error)
+                    if isinstance(error, NoWorkers):
+                        yield from ((each, result) for each in waiting)
+                        waiting.clear()
+                yield span, result
+    finally:
+        for future in running:
+            future.cancel()
+        if inside:
+            # Do not wait for the threads, so that Ctrl-C can also interrupt a compilation.
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _reason(error: Exception) -> str:
+    """Return the reason why a chunk failed."""
+    if isinstance(error, FflinError | WorkerDied | NoWorkers):
+        return str(error)
+    return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
+
+
+def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
+    """Run a pickled job on one chunk; called in a worker."""
+    job = _unpickled(pickled)
+    out = {key: np.empty((stop - start, *shape)) for key, shape in job.shapes.items()}
+    return out, job.run(rows, start, out)
+
+
+@lru_cache(maxsize=4)
+def _unpickled(job: bytes) -> Job:
+    """Return an unpickled job, cached in each worker so that the job is prepared once."""
+    result: Job = pickle.loads(job)
+    return result
+
+
 def failure(
-    failed: list[Done],
+    failed: list[Failed],
     store: FileStore | MemoryStore,
     of_what: str,
     made: Callable[[Mask], object],
 ) -> SweepError:
     """Return the error that lists the failed chunks."""
     kept = np.ones(store.count, dtype=bool)
-    for (start, stop), *_ in failed:
+    for start, stop, _ in failed:
         kept[start:stop] = False
-    numbers = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
+    numbers = listed(f"{start} to {stop - 1}" for start, stop, _ in failed)
     message = (
         f"{len(failed)} of {-(-store.count // store.chunk)} chunks "
-        f"{'has' if len(failed) == 1 else 'have'} failed, {of_what} {numbers}: "
-        f"{failed[0].reason}"
+        f"{'has' if len(failed) == 1 else 'have'} failed, {of_what} {numbers}: {failed[0][2]}"
     )
     batch = None
     if not kept.any():
@@ -175,104 +271,157 @@ def failure(
             "out='NAME.h5' (-o NAME.h5), the results would be saved, and the same call would "
             "resume"
         )
-    return SweepError(message, tuple((*span, reason) for span, _, reason in failed), batch)
+    return SweepError(message, tuple(failed), batch)
 
 
-def _run_here(
-    job: Job[R_contra],
-    rows: Callable[[int, int], R_contra],
-    store: FileStore | MemoryStore,
-    spans: list[Span],
-    threads: int,
-) -> Iterator[Done]:
-    def run(span: Span) -> Done:
-        view = store.view(*span)
-        out = None if view is None else {key: view[key] for key in job.shapes}
+class WorkerDied(BrokenExecutor):
+    """Error for a task whose worker process died; other workers continue."""
+
+
+class NoWorkers(BrokenExecutor):
+    """Error for worker processes that cannot be started."""
+
+
+class OwnWorkers(Executor):
+    """Executor with worker processes; if one dies, its task fails and another one starts."""
+
+    def __init__(self, count: int) -> None:
+        cores = available_cores()
+        if count > cores:
+            said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
+            warnings.warn(said, FflinWarning, stacklevel=4)
+            count = cores
+        self._max_workers = count
+        # With fork, a process would inherit locks that other threads hold, and could wait for them
+        # forever.
+        self._context = get_context("spawn")
+        self._threads = ThreadPoolExecutor(count)
+        self._mine = local()
+        self._lock, self._closed = Lock(), False
+        self._processes: dict[BaseProcess, Connection] = {}
+
+    def submit(self, fn: Callable[..., object], /, *args: object, **kwargs: object) -> Future[Any]:
+        """Call a function in a worker process; raise `WorkerDied` if the process dies."""
+        return self._threads.submit(self._do, (fn, args, kwargs))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, even in the middle of a task."""
+        with self._lock:
+            self._closed = True
+            for process in self._processes:
+                process.terminate()
+        # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait
+        # for a future, the future remains locked. A thread that must set the result of this future
+        # would never end.
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for process in list(self._processes):
+            self._end(process)
+
+    def _do(self, task: object) -> Any:
+        process = getattr(self._mine, "process", None) or self._start()
+        pipe = self._processes[process]
         try:
-            return Done(span, job.run(rows(*span), span.start, out), "")
-        except FflinError as error:
-            return Done(span, None, str(error))
+            pipe.send(task)
+            error, result = pipe.recv()
+        except (EOFError, OSError):
+            self._mine.process = None
+            self._end(process)
+            raise WorkerDied(
+                "a worker process died, for example because the memory was full"
+            ) from None
+        if error is not None:
+            raise error
+        return result
 
-    if threads == 1 or len(spans) == 1:
-        yield from map(run, spans)
+    def _start(self) -> BaseProcess:
+        """Start a process for this thread and wait until it is ready."""
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
+        with self._lock:
+            if self._closed:
+                raise NoWorkers("the workers have been shut down")
+            try:
+                with _starting():
+                    process.start()
+            except OSError as error:
+                raise NoWorkers(f"no worker process can be started: {error}") from None
+            self._processes[process] = ours
+        theirs.close()
+        try:
+            ours.recv()
+        except (EOFError, OSError):
+            self._end(process)
+            raise NoWorkers(
+                'a worker process did not start; make the call under `if __name__ == "__main__":`'
+            ) from None
+        self._mine.process = process
+        return process
+
+    def _end(self, process: BaseProcess) -> None:
+        pipe = self._processes.pop(process, None)
+        if pipe is None:  # another thread is already ending it
+            return
+        pipe.close()
+        process.join(_PATIENCE)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        process.close()
+
+
+# Threads start workers one at a time, because `_starting` changes a module that all threads share.
+_TURN = Lock()
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Start processes that import nothing from the working folder and ignore Ctrl-C.
+
+    By default, a process that multiprocessing starts imports from the working folder first, until
+    it has copied `sys.path` from its parent process. Ctrl-C also reaches the parent process, which
+    ends the others.
+    """
+    from multiprocessing import resource_tracker, util
+
+    module: Any = util
+    with _TURN:
+        usual = module._args_from_interpreter_flags
+        module._args_from_interpreter_flags = lambda: ["-I", *usual()]
+        masked = getattr(signal, "pthread_sigmask", None)  # not on Windows
+        if masked:
+            # Start the resource tracker first. If it were started together with a process, it would
+            # unblock the signal.
+            resource_tracker.ensure_running()
+            before = masked(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            module._args_from_interpreter_flags = usual
+            if masked:
+                masked(signal.SIG_SETMASK, before)
+
+
+def _serve(pipe: Connection) -> None:
+    """Run tasks until the parent closes the pipe or ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_the_caller, daemon=True).start()
+    try:
+        pipe.send(None)
+        while True:
+            function, args, kwargs = pipe.recv()
+            answer: tuple[Exception | None, object]
+            try:
+                answer = None, function(*args, **kwargs)
+            except Exception as error:
+                answer = error, None
+            pipe.send(answer)
+    except (EOFError, OSError):
         return
-    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
-    try:
-        for span in spans:
-            begun.append(pool.submit(run, span))
-            # Results wait in memory until they are consumed, so their number is limited.
-            if len(begun) > threads:
-                yield begun.popleft().result()
-        while begun:
-            yield begun.popleft().result()
-    finally:
-        # Do not wait for the threads, so that Ctrl-C can also interrupt a compilation.
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_on_workers(
-    job: Job[R_contra], rows: Callable[[int, int], R_contra], spans: list[Span], executor: Executor
-) -> Iterator[Done]:
-    pickled, ahead = pickle.dumps(job), _QUEUED * worker_count(executor)
-    waiting, running = deque(spans), dict[Future[ChunkResult], Span]()
-    try:
-        while waiting or running:
-            while waiting and len(running) < ahead:
-                span = waiting.popleft()
-                try:
-                    future = executor.submit(work, pickled, rows(*span), span.start)
-                except Exception as error:  # broken, shut down, or specific to the executor
-                    yield Done(span, None, _reason(error))
-                else:
-                    running[future] = span
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                span = running.pop(future)
-                try:
-                    done = Done(span, future.result(), "")
-                except Exception as error:  # each executor raises its own types
-                    done = Done(span, None, _reason(error))
-                    if isinstance(error, NoWorkers):
-                        yield from (Done(each, None, done.reason) for each in waiting)
-                        waiting.clear()
-                yield done
-    finally:
-        for future in running:
-            future.cancel()
-
-
-def _reason(error: Exception) -> str:
-    """Return the reason why a chunk failed."""
-    if isinstance(error, FflinError | WorkerDied | NoWorkers):
-        return str(error)
-    return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
-
-
-def executor_of(
-    executor: Executor | None, workers: int | None
-) -> AbstractContextManager[Executor | None]:
-    """Return a context with the given executor, or with an executor whose processes end with it."""
-    return OwnWorkers(workers) if workers else nullcontext(executor)
-
-
-def work(job: bytes, rows: Rows, start: int) -> ChunkResult:
-    """Run a pickled job on one chunk; called in a worker."""
-    return _unpickled(job).run(rows, start)
-
-
-@lru_cache(maxsize=4)
-def _unpickled(job: bytes) -> Job[Rows]:
-    """Return an unpickled job, cached in each worker so that the job is prepared once."""
-    result: Job[Rows] = pickle.loads(job)
-    return result
-
-
-def worker_count(executor: Executor) -> int:
-    """Return the number of workers of an executor, or a default if the number is unknown."""
-    for name in ("_max_workers", "num_workers"):
-        count = getattr(executor, name, None)
-        if isinstance(count, int) and count > 0:
-            return count
-    client = getattr(executor, "_client", None)
-    if client is not None and hasattr(client, "nthreads"):
-        return max(1, sum(client.nthreads().values()))
-    return _UNKNOWN_WORKERS
+def _end_with_the_caller() -> None:
+    """End this process when its parent process ends, even in the middle of a task."""
+    caller = parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)

@@ -5,31 +5,40 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
+from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, frozen
-from fflin.batch.chunks import ChunkJob
+from fflin.base.validation import Array, Indices, frozen
 from fflin.batch.configurations import (
     Configurations,
     GivenConfigurations,
     as_configurations,
+    checked_inputs,
+    checked_velocities,
+    column,
     content,
 )
-from fflin.batch.files import FileStore, MemoryStore, output_path
+from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, LinearBatch, fields_of_model
-from fflin.batch.rows import Points, checked_inputs, checked_velocities, column
-from fflin.batch.run import Progress, check_workers, executor_of, failure, run_chunks
-from fflin.kernel.compiled import available_cores
+from fflin.batch.run import Execution, Progress, Rows, failure, run_chunks
+from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
+from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
+from fflin.kernel.compiled import checked_engine
+from fflin.kernel.tree import LANES
+from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.linear.state_equations import assemble, drift
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -37,6 +46,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.dynamics.state import Frame
+    from fflin.kernel.derivatives import Mask, RowAccelerations
 
 # Size of a chunk's result: large enough that computing it takes much longer than sending it, and
 # small enough that several of them fit in memory.
@@ -45,6 +55,15 @@ _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
 # Least number of chunks, so that all workers finish at about the same time.
 _SHARES = 32
+
+# Warning filters belong to the whole process, so only one thread at a time changes them.
+_TURN = Lock()
+
+# Attributes that identify a robot, in addition to its model and its mappings.
+_OF_THE_ROBOT = (
+    *("name", "urdf_sha256", "locked", "joints", "followers"),
+    *("inputs", "outputs", "gravity", "orbit"),
+)
 
 _log = logging.getLogger("fflin")
 
@@ -143,7 +162,7 @@ def sweep(
     >>> len(batch), batch[3].B.shape
     (10, (18, 9))
     """
-    check_workers(executor, workers, threads, chunk, progress)
+    how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
     job = ChunkJob(
@@ -155,76 +174,181 @@ def sweep(
         moving=moving,
     )
     task = SweepTask(job, points, v, u)
-    parallel = executor is not None or workers is not None
-    threads = threads or available_cores()
-    shares = (_SHARES, 1) if parallel else (4 * threads, threads)
-    store = _store(task, path, chunk or _chunk_size(task, *shares))
-    with closing(store), executor_of(executor, workers) as others:
-        if others is None and not job.compiled:
-            threads = 1
-        failed = run_chunks(
-            job, task.points, store, executor=others, threads=threads, progress=progress
+    count, size, row = task.count, chunk, job.row_bytes
+    if size is None:
+        same = how.count(job) if how.executor is None else 1
+        shares = 4 * same if how.executor is None else _SHARES
+        size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // shares)) // row
+        size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
+        # All threads compute equally many chunks.
+        chunks = math.ceil(math.ceil(count / size) / same) * same
+        size = math.ceil(count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
+    store: FileStore | MemoryStore
+    if path is None or path.suffix == ".npz":
+        held = {key: shape for key, shape in task.shapes.items() if key not in task.given}
+        store = MemoryStore(count, size, held)
+    else:
+        store = FileStore(
+            path, task.request, count, size, task.shapes, task.constants, task.texts()
         )
+        if store.resumed:
+            _log.info("resuming from %s", store.part)
+    with closing(store), how:
+        failed = run_chunks(job, task.rows, store, how, progress)
         if failed:
             raise failure(
-                failed, store, "configurations", lambda kept: _in_memory(task, store)[kept]
+                failed,
+                store,
+                "configurations",
+                lambda kept: task.batch(task.given | store.read(count))[kept],
             )
-        return _finish(task, store, path)
-
-
-def planned_bytes(robot: Robot, count: int, **options: Any) -> int:
-    """Return the size [bytes] of a sweep's result over `count` points; see `ChunkJob`."""
-    return count * _row_bytes(ChunkJob(robot, moving=False, **options))
-
-
-def _row_bytes(job: ChunkJob) -> int:
-    return 8 * (job.linearizer.robot.nq + sum(map(math.prod, job.shapes.values())))
-
-
-def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
-    """Return the number of points per chunk that gives all threads equally many chunks."""
-    row = _row_bytes(task.job)
-    size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
-    size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
-    chunks = math.ceil(math.ceil(task.count / size) / threads) * threads
-    return math.ceil(task.count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
-
-
-def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryStore:
-    given, shapes = task.given(), {**task.job.shapes, "q": (task.robot.nq,)}
-    if path is None or path.suffix == ".npz":
-        held = {key: shape for key, shape in shapes.items() if key not in given}
-        return MemoryStore(task.count, size, held)
-    shapes |= {key: rows.shape[1:] for key, rows in given.items()}
-    constants = task.constants(shapes)
-    texts = task.texts(constants)
-    store = FileStore(path, task.request, task.count, size, shapes, constants, texts)
-    if store.resumed:
-        _log.info("resuming from %s", store.part)
-    return store
-
-
-def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
-    if isinstance(store, FileStore):
-        store.complete()
-        # This call has just written the file, so its checksums are not verified.
-        return replace(LinearBatch.load(store.path, task.robot, verify=False), verified=True)
-    batch = _in_memory(task, store)
-    if path is not None:
+        batch = task.batch(task.given | store.complete())
+    if path is not None and path.suffix == ".npz":
         batch.save(path)
     return batch
 
 
-def _in_memory(task: SweepTask, store: FileStore | MemoryStore) -> LinearBatch:
-    assert isinstance(store, MemoryStore)
-    return task.batch(task.given() | store.arrays)
+def planned_bytes(robot: Robot, count: int, **options: Any) -> int:
+    """Return the size [bytes] of a sweep's result over `count` points; see `ChunkJob`."""
+    return count * ChunkJob(robot, moving=False, **options).row_bytes
 
 
-# Attributes that identify a robot, in addition to its model and its mappings.
-_OF_THE_ROBOT = (
-    *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "gravity", "orbit"),
-)
+class ChunkJob:
+    """Job that linearises chunks of points with `Linearizer`; `at_rest` means zero velocity.
+
+    The rows of a chunk are q, and v and u0 unless they are zero.
+    """
+
+    def __init__(
+        self, robot: Robot, *, at_rest: bool, engine: str | None = None, **options: Any
+    ) -> None:
+        self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
+        self._engine = checked_engine(engine)
+        self.linearizer = Linearizer(robot, **options)
+        prepared = self.linearizer.prepared
+        if engine == "compiled":
+            if prepared.sensing is not None:
+                raise InputError(
+                    "engine='compiled' is not possible, because the outputs are not the state; "
+                    "leave engine out"
+                )
+            prepared.kernel()  # raises an error if there is none
+        # If a free robot is at rest about its own reference, A and f0 are constant, so only B is
+        # computed.
+        self.only_inertia = at_rest and prepared.own_reference and prepared.free
+        nx, nu = prepared.map.nx, len(prepared.actuation.names)
+        ny = len(prepared.common["output_names"])
+        # Shape per point of each array that varies between points.
+        self.shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
+        if not self.only_inertia:
+            self.shapes |= {"A": (nx, nx), "f0": (nx,), "_x0": (nx,)}
+            if prepared.moving:
+                self.shapes["_drift"] = (nx,)
+            if prepared.sensing is not None:
+                self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
+        self.row_bytes = 8 * (robot.nq + sum(map(math.prod, self.shapes.values())))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Only the arguments are pickled, because each worker needs its own work space.
+        return self._again, ()
+
+    @cached_property
+    def _kernel(self) -> RowAccelerations | None:
+        """Compiled accelerations for many points at once; None if Python computes the points."""
+        prepared = self.linearizer.prepared
+        if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
+            return None
+        return prepared.kernel()
+
+    @property
+    def threaded(self) -> bool:
+        """Whether threads can compute chunks in parallel; see `Job`."""
+        return self._kernel is not None
+
+    def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
+        """Linearise about the points of a chunk; see `Job`."""
+        left = self.write(rows, out) if self._kernel else np.arange(len(rows["q"]))
+        if not len(left):
+            return []
+        with _TURN, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", FflinWarning)
+            for row in left.tolist():
+                with located(f"configuration {start + row}"):
+                    self._write_one({key: each[row] for key, each in rows.items()}, row, out)
+        return [str(note.message) for note in caught]
+
+    def _write_one(self, point: Mapping[str, Array], row: int, out: Mapping[str, Array]) -> None:
+        """Write a row in Python."""
+        q, nv = point["q"], self.shapes["B_lower"][0]
+        if not self.only_inertia:
+            lin = self.linearizer(q, point.get("v"), point.get("u0"))
+            for key, array in out.items():
+                array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.removeprefix("_"))
+            return
+        (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
+        B_lower = out["B_lower"][row]
+        inverse = B_lower if actuation.default else np.empty((nv, nv))
+        inertia.invert(q, inverse)
+        if not actuation.default:
+            # The columns do not depend on the base position, so the base is moved to the origin to
+            # avoid rounding errors.
+            np.matmul(inverse, actuation.columns(data, inertia.centred(q)), out=B_lower)
+
+    @cached_property
+    def _inertia(self) -> tuple[Inertia, pin.Data]:
+        data = self.linearizer.robot.create_data()
+        return Inertia(self.linearizer.prepared.map, data), data
+
+    def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
+        """Write rows in compiled code; return the rows for which this is not accurate."""
+        kernel, q = self._kernel, rows["q"]
+        assert kernel is not None
+        count = len(q)
+        if count < LANES:  # fill up the lanes by repeating the last row
+            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
+            for key, array in out.items():
+                more[key] = np.empty((LANES, *array.shape[1:]))
+            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
+        with np.errstate(all="ignore"):
+            if self.only_inertia:
+                good = kernel.sound(q, kernel.write_inverse(q, out["B_lower"]))
+            else:
+                good = self._write_anywhere(kernel, rows, out)
+        return np.flatnonzero(~good)
+
+    def _write_anywhere(
+        self, kernel: RowAccelerations, rows: Rows, out: Mapping[str, Array]
+    ) -> Mask:
+        """Write A, B, f0 and x0 about any points, and return which rows are valid."""
+        ready, q, A, B = self.linearizer.prepared, rows["q"], out["A"], out["B_lower"]
+        state, actuation, count = ready.map, ready.actuation, len(q)
+        own = ready.own_reference
+        chart: Chart = Standing(count) if own else state.charts(q)
+        r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
+        nu: Array = np.zeros((count, B.shape[1]))
+        u: Array = np.zeros((count, B.shape[2]))
+        if "v" in rows:
+            nu = state.velocities(rows["v"])
+        if "u0" in rows:
+            u = actuation.in_base_axes(chart, rows["u0"])
+        q_m, nv = state.joint_positions(q), nu.shape[1]
+        A[:, :nv] = ready.rest["A"][:nv]
+        c, judged = kernel.write(q, nu, q_m, u, A, B)
+        rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
+        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
+        out["f0"][:] = 0.0 if ready.moving else f0
+        if ready.moving:
+            out["_drift"][:] = drift(state, f0, rates.gravity)
+        # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
+        # checked, because it is finite if q0 and f0 are valid.
+        good = kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
+        for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
+            good &= np.vecdot(values, values) < LARGEST
+        return good
 
 
 class SweepTask:
@@ -239,47 +363,44 @@ class SweepTask:
     ) -> None:
         self.job, self.robot = job, job.linearizer.robot
         self.configurations, self.count = configurations, len(configurations)
-        names = job.linearizer.prepared.actuation.names
-        self.v = None if v is None else checked_velocities(self.robot, v, self.count)
-        self.u = None if u is None else checked_inputs(names, u, self.count)
-
-    def points(self, start: int, stop: int) -> Points:
-        """Return points start to stop - 1."""
-        v, u = (None if rows is None else rows[start:stop] for rows in (self.v, self.u))
-        return Points(self.configurations.rows(start, stop), v, u)
-
-    def given(self) -> dict[str, Array]:
-        """Return the arrays that vary between points and are known before the sweep."""
-        rows = {"v": self.v, "u0": self.u}
-        if isinstance(self.configurations, GivenConfigurations):
-            rows["q"] = self.configurations.q
-        return {key: x for key, x in rows.items() if x is not None and x.strides[0] != 0}
-
-    def constants(self, varying: Iterable[str]) -> dict[str, Array]:
-        """Return one row of each array that is the same at all points."""
-        prepared, root = self.job.linearizer.prepared, self.robot.model.jointPlacements[ROOT]
-        rows: dict[str, Array] = {
+        prepared, root = job.linearizer.prepared, self.robot.model.jointPlacements[ROOT]
+        # Rows that are known before the sweep; a velocity or input of all points is one row.
+        self._known: dict[str, Array] = {}
+        if v is not None:
+            self._known["v"] = checked_velocities(self.robot, v, self.count)
+        if u is not None:
+            self._known["u0"] = checked_inputs(prepared.actuation.names, u, self.count)
+        # The known arrays that vary between points, and the shapes per point of all that do.
+        self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
+        if isinstance(configurations, GivenConfigurations):
+            self.given["q"] = configurations.q
+        self.shapes = {**job.shapes, "q": (self.robot.nq,)}
+        self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
+        constants: dict[str, Array] = {
             **prepared.rest,
             "C": prepared.common["C"],
             "D": prepared.common["D"],
             "_root": AT_ROOT if root.isIdentity(0.0) else pin.SE3ToXYZQUAT(root),
+            **{key: rows[0] for key, rows in self._known.items()},
         }
-        if self.u is not None:
-            rows["u0"] = self.u[0]
-        if self.v is not None:
-            rows["v"] = self.v[0]
         if not prepared.own_reference:
-            rows["_reference"] = prepared.reference
-        return {key: value for key, value in rows.items() if key not in varying}
+            constants["_reference"] = prepared.reference
+        # One row of each array that is the same at all points.
+        self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
+
+    def rows(self, start: int, stop: int) -> dict[str, Array]:
+        """Return points start to stop - 1."""
+        q = self.configurations.rows(start, stop)
+        return {"q": q, **{key: rows[start:stop] for key, rows in self._known.items()}}
 
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
         """Assemble a batch from the arrays that vary between points."""
         count = len(arrays["q"])
         rows: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
-        for key, value in self.constants(arrays).items():
+        for key, value in self.constants.items():
             rows[key] = np.broadcast_to(value, (count, *value.shape))
-        for key, value in arrays.items():
-            rows[key] = frozen(value.view())
+        for key in self.shapes:
+            rows[key] = frozen(arrays[key].view())
         common = dict(self.job.linearizer.prepared.common)
         asked = fields_of_model(common)
         texts = {
@@ -288,11 +409,11 @@ class SweepTask:
         columns = tuple(map(column, self.robot.joints))
         return LinearBatch(**texts, **rows, columns=columns, _asked=asked)
 
-    def texts(self, constants: Iterable[str]) -> dict[str, str]:
+    def texts(self) -> dict[str, str]:
         """Return the strings that a file of the batch contains."""
-        one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
-        example = self.batch(one | {"q": self.points(0, 1).q})
-        return {**example.header(self.count), "constant": json.dumps(list(constants))}
+        example = {key: np.empty((1, *shape)) for key, shape in self.shapes.items()}
+        header = self.batch(example | self.rows(0, 1)).header(self.count)
+        return {**header, "constant": json.dumps(list(self.constants))}
 
     @property
     def request(self) -> str:
@@ -304,13 +425,12 @@ class SweepTask:
         settings += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
         settings += [prepared.map.frame, prepared.moving, prepared.own_reference]
         settings += [self.job.only_inertia, __version__, pin.__version__, self.count]
-        rows = {"v": self.v, "u": self.u}
         return content_digest(
             {
                 "robot": repr(settings),
                 "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
                 "reference": prepared.reference,
-                **{key: "none" if value is None else value for key, value in rows.items()},
+                **self._known,
                 **{f"of q: {key}": value for key, value in content(self.configurations).items()},
             }
         )

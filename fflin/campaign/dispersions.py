@@ -27,11 +27,11 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, loads_of
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
+from fflin.robot.mass_properties import bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
+from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
-from fflin.simulation.times import Times
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
@@ -48,16 +48,6 @@ class Column(NamedTuple):
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
     at: tuple[tuple[int, int], ...]  # (index of state, body, joint, .., axis)
     inverse: Callable[[Array], Array]  # inverse distribution function
-
-
-class Draws(NamedTuple):
-    """Drawn values (N, k) of some runs."""
-
-    drawn: Array
-
-    def part(self, start: int, stop: int) -> Draws:
-        """Return runs start to stop - 1."""
-        return Draws(self.drawn[start:stop])
 
 
 class Bound(NamedTuple):
@@ -204,15 +194,18 @@ class Dispersions:
         """Names of the dispersed values."""
         return tuple(column.name for column in self.columns)
 
-    def rows(self, start: int, stop: int) -> Draws:
-        """Return the draws of runs start to stop - 1; they depend only on seed, name and run."""
+    def drawn(self, start: int, stop: int) -> Array:
+        """Return the values (N, k) of runs start to stop - 1.
+
+        They depend only on seed, name and run.
+        """
         drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
             for first in range(start // _BLOCK * _BLOCK, stop, _BLOCK):
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
                 drawn[low - start : high - start, at] = values[low - first : high - first]
-        return Draws(drawn)
+        return drawn
 
     def _uniform(self, column: Column, block: int) -> Array:
         key = (self._seed, zlib.crc32(column.name.encode()))
@@ -243,7 +236,7 @@ class Dispersions:
     def require_possible(self, runs: int) -> None:
         """Raise `InputError` if a drawn value gives an invalid robot or attitude."""
         for start in range(0, runs, _BLOCK):
-            drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
+            drawn = self.drawn(start, min(start + _BLOCK, runs))
             for values, column in zip(drawn.T, self.columns, strict=True):
                 least = -1.0 if column.kind in _FACTORS else -np.inf
                 bad = ~np.isfinite(values) | (values <= least)
@@ -291,18 +284,12 @@ class Dispersions:
         mass, com, inertia, density = (
             self._of(kind, drawn, len(pieces), len(axes)) for kind, axes in _OF_BODIES.items()
         )
-        changed: dict[int, list[tuple[Piece, tuple[Array, Array, Array]]]] = {}
+        changed: dict[int, list[Array]] = {}
         for at in sorted({at for _, at in self._changed(*_OF_BODIES)}):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
-            properties = varied(
-                pieces[at],
-                mass=mass[:, at, 0],
-                density=density[:, at, 0],
-                com=com[:, at],
-                inertia=inertia[:, at],
-            )
-            changed.setdefault(own, []).append((pieces[at], properties))
+            changes = mass[:, at, 0], density[:, at, 0], com[:, at], inertia[:, at]
+            changed.setdefault(own, []).append(varied(pieces[at], *changes))
         return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
 
     def _springs(self, kind: str, drawn: Array) -> Array:

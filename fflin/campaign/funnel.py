@@ -29,8 +29,7 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.base.writing import as_path
-from fflin.batch.run import Progress, check_workers, executor_of
-from fflin.campaign.dispersions import Draws
+from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
 from fflin.control.gain_schedule import GainSchedule
@@ -369,23 +368,20 @@ def funnel(
     by_level = not isinstance(goal, Mapping)
     final = _bounds("goal", {"level": goal} if by_level else goal, ["level"] if by_level else KINDS)
     limits = _bounds("within", {} if within is None else within, KINDS)
-    check_workers(executor, workers, threads, None, progress)
+    how = Execution(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
     reached = Judge(("outcome",), partial(_outcomes, final, limits, by.P[-1]))
     indices = _indices(motion, by, knots)
-    jobs = [runs_from(robot, feedback, *pair, options, reached) for pair in indices]
-    for job in jobs:
-        job.choose(engine)
+    jobs = [runs_from(robot, feedback, *pair, engine, options, reached) for pair in indices]
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
-    with executor_of(executor, workers) as others:
+    with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
             axes = ellipsoid_axes(by.P[first])
             drawn = partial(_starts, job.x0, by.P[first], axes, rng)
 
             def simulate(roots: Array, job: CampaignJob = job, drawn: Any = drawn) -> Array:
-                rows = Draws(drawn(roots)).part
-                return completed(job, rows, len(roots), others, workers, threads)["outcome"]
+                return completed(job, drawn(roots), how)["outcome"]
 
             root = _largest_root(simulate, _widest(axes, robot))
             tried[knot] = root**2
@@ -444,6 +440,7 @@ def runs_from(
     feedback: TrajectoryFeedback,
     k: int,
     first: int,
+    engine: str | None,
     options: Mapping[str, Any],
     judge: Judge | None = None,
 ) -> CampaignJob:
@@ -457,7 +454,7 @@ def runs_from(
     # The chart is centred at the knot, because its attitude may be any rotation. Histories have
     # entries at the start and at the end.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
-    return CampaignJob(robot, policy, None, 0, "python", options, judge)
+    return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
 def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:

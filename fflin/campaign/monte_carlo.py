@@ -27,12 +27,11 @@ from fflin.batch.files import (
     read_rows,
     require_room,
 )
-from fflin.batch.run import Progress, check_workers, executor_of, failure, run_chunks
+from fflin.batch.run import Execution, Progress, failure, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
 from fflin.campaign.runs import CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
 from fflin.campaign.statistics import KINDS
-from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions
@@ -44,7 +43,7 @@ from fflin.simulation.report import pushed
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
-    *("duration", "events", "callback", "linear", "every", "progress")
+    *("robot", "policy", "duration", "events", "callback", "linear", "every", "progress", "engine")
 }
 
 
@@ -206,37 +205,37 @@ def monte_carlo(
     require_known("option of monte_carlo", options, sorted(_OPTIONS))
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
     width, confidence = share("width", width), share("confidence", confidence)
-    check_workers(executor, workers, threads, chunk, progress)
+    how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     options |= {"duration": duration, "histories": whole("histories", histories, 0)}
-    job = CampaignJob(robot, policy, dispersions, seed, "", options)
+    job = CampaignJob(robot, policy, dispersions, seed, engine, options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
-    threads = threads or available_cores()
-    size = _chunk(runs, chunk, workers or threads, until is not None)
-    store: Any = None
+    size = _chunk(runs, chunk, how.count(job), staged=until is not None)
+    store: MemoryStore | FileStore | None = None
     if path is None or path.suffix == ".npz":
         store = MemoryStore(runs, size, shapes)
     elif not part_of(path).exists():
         require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
-    if executor or workers:
+    if how.executor:
         _require_sendable(job)
-    job.choose(engine)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
-    request = _request(job, header) if path else ""
-    earlier = _earlier(path, request) if path and not truth("overwrite", overwrite) else None
-    if earlier and until is None and len(earlier) == runs:
-        return replace(earlier, goals=tuple(header["goals"]), confidence=confidence, _job=job)
-    if path and store is None:
-        texts = {"header": json.dumps(header), "constant": "[]"}
-        store = FileStore(path, request, runs, size, shapes, {}, texts)
-    with closing(store), executor_of(executor, workers) as others:
-        how: Any = {"executor": others, "progress": progress, "threads": job.threads(threads)}
-        expect(progress, [(job, job.dispersions.rows(0, min(runs, LANES)), runs)], others, threads)
+    request = ""
+    if path:
+        request = _request(job, header)
+        earlier = None if truth("overwrite", overwrite) else _earlier(path, request)
+        if earlier and until is None and len(earlier) == runs:
+            return replace(earlier, goals=header["goals"], confidence=confidence, _job=job)
+        if store is None:
+            texts = {"header": json.dumps(header), "constant": "[]"}
+            store = FileStore(path, request, runs, size, shapes, {}, texts)
+    assert store is not None
+    with closing(store), how:
+        expect(progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
         done = runs if until is None else min(_STAGE, runs)
-        while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
+        while not (failed := run_chunks(job, job.rows, store, how, progress, upto=done)):
             if done == runs:
                 break
             found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
@@ -250,36 +249,41 @@ def monte_carlo(
                     {key: rows[kept] for key, rows in store.read(runs).items()}, header, job
                 ),
             )
-        if isinstance(store, MemoryStore):
-            campaign = Campaign.of(store.read(done), header, job)
-            if path is not None:
-                campaign._save(path, request=request)
-            return campaign
-        _complete(store, done, shapes)
-    return replace(Campaign.load(store.path), _job=job)
+        for start in range(done, runs, store.chunk):  # runs that `until` has made unnecessary
+            stop = min(start + store.chunk, runs)
+            unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+            store.write(start, stop, unused)
+        campaign = Campaign.of(store.complete(), header, job)
+    if path and path.suffix == ".npz":
+        campaign._save(path, request=request)
+    return campaign
+
+
+def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
+    """Return the number of runs per chunk."""
+    if given is None:
+        return chunk_size(min(_STAGE, runs) if staged else runs, workers)
+    size = -(-given // LANES) * LANES
+    if staged and _STAGE % size:
+        raise InputError(
+            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
+        )
+    return size
 
 
 def _goals(
-    given: object, until: object, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
-) -> list[str]:
+    given: object, until: str | None, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
+) -> tuple[str, ...]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
     listed = [given] if isinstance(given, str) else given
-    expected = "a list such as ['attitude < 1 deg']"
-    goals: Any = instance("goals", listed, (list, tuple), expected)
-    goals = [*goals, *([] if until is None or until in goals else [until])]
+    goals: list[str] = [
+        *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
+        *([] if until is None else [until]),
+    ]
+    none = Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": ()})
     for goal in goals:
-        instance("a goal", goal, str, "a text such as 'attitude < 1 deg'")
-        Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
-    return goals
-
-
-def _complete(store: FileStore, done: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Complete a file whose runs from `done` on are not needed."""
-    for start in range(done, store.count, store.chunk):
-        stop = min(start + store.chunk, store.count)
-        unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
-        store.write(start, stop, unused)
-    store.complete()
+        none.met(instance("a goal", goal, str, "a text such as 'attitude < 1 deg'"))
+    return tuple(dict.fromkeys(goals))
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
@@ -305,18 +309,6 @@ def _require_sendable(job: CampaignJob) -> None:
         ) from None
 
 
-def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
-    """Return the number of runs per chunk."""
-    if given is None:
-        return chunk_size(min(_STAGE, runs) if staged else runs, workers)
-    size = -(-given // LANES) * LANES
-    if staged and _STAGE % size:
-        raise InputError(
-            f"chunk is {given}, but with until it must be a divisor of {_STAGE}, such as 32"
-        )
-    return size
-
-
 def _header(job: CampaignJob) -> dict[str, Any]:
     """Return the header of a campaign: everything that is not an array."""
     plan, plant = job.plan, job.plant
@@ -327,11 +319,11 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
     return {
         "kind": "Campaign",
-        "names": list(job.dispersions.names),
-        "state_names": list(plant.state.names),
-        "state_units": list(plant.state.units),
-        "input_names": list(plant.actuation.names),
-        "input_units": list(plant.actuation.units),
+        "names": job.dispersions.names,
+        "state_names": plant.state.names,
+        "state_units": plant.state.units,
+        "input_names": plant.actuation.names,
+        "input_units": plant.actuation.units,
         "judged": [kind for kind, group in groups if group in steered],
         "robot": plant.robot.name,
         "urdf_sha256": plant.robot.urdf_sha256,
@@ -345,8 +337,7 @@ def _header(job: CampaignJob) -> dict[str, Any]:
 
 def _request(job: CampaignJob, header: dict[str, Any]) -> str:
     """Return a digest of everything on which the result depends."""
-    draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
+    drawn = job.dispersions.drawn(0, min(header["asked"], _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))
-    first = job.digest(draws.part(0, 1))
-    return content_digest({"call": call, "drawn": draws.drawn, "first": first})
+    return content_digest({"call": call, "drawn": drawn, "first": job.digest(drawn[:1])})

@@ -18,8 +18,8 @@ from fflin.analysis.names import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Indices, Mask, as_double, instance
-from fflin.campaign.dispersions import Draws
+from fflin.base.validation import Array, Mask, as_double, instance
+from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Judge
 from fflin.control.policies import StateFeedback
@@ -122,7 +122,12 @@ class Loop:
 
 
 def settling_runs(
-    loop: Loop, predicts: bool, limits: object, joint: float, fine: int = 0
+    loop: Loop,
+    predicts: bool,
+    limits: object,
+    joint: float,
+    engine: str | None = None,
+    fine: int = 0,
 ) -> CampaignJob:
     """Return runs of a loop from displaced states; a run ends if it settles, or at a horizon.
 
@@ -158,7 +163,7 @@ def settling_runs(
     step = _transition(loop, dt, every) if predicts else None
     figures, over = partial(_figures, loop, step), None if predicts else partial(_is_over, loop)
     judge = Judge(("outcome", "error"), figures, over)
-    return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, "python", options, judge)
+    return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, engine, options, judge)
 
 
 def _transition(loop: Loop, dt: float, every: int) -> Array:
@@ -201,32 +206,24 @@ def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[
 
 
 def settle(
-    runs_of: Callable[[int], CampaignJob],
-    starts: Callable[[Indices], Array],
-    count: int,
-    engine: str | None = None,
-    **how: Any,
+    runs_of: Callable[..., CampaignJob],
+    starts: Array,
+    how: Execution,
+    progress: Progress | None = None,
 ) -> dict[str, Array]:
-    """Return the results of runs; diverging runs are repeated with shorter steps.
+    """Return the results of runs from initial deviations (N, nx).
 
-    `runs_of` creates the runs after a number of step reductions. `starts` returns the initial
-    deviations (N, nx) of runs (N,).
+    `runs_of(fine=k)` creates the runs after k step reductions. Diverging runs are repeated with
+    shorter steps.
     """
-    arrays, left = dict[str, Array](), np.arange(count)
+    arrays, left = dict[str, Array](), np.arange(len(starts))
     for fine in range(_FINEST + 1):
-        job = runs_of(fine)
-        job.choose(engine)
-
-        def rows(start: int, stop: int, left: Indices = left) -> Draws:
-            return Draws(starts(left[start:stop]))
-
-        found = completed(job, rows, len(left), **how)
+        found = completed(runs_of(fine=fine), starts[left], how, None if fine else progress)
         for key, values in found.items():
             arrays.setdefault(key, values)[left] = values
         left = left[found["outcome"] == OUTCOMES.index("diverged")]
         if not len(left):
             break
-        how["progress"] = None
     return arrays
 
 

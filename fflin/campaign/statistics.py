@@ -19,6 +19,7 @@ from fflin.kernel import loop
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES
+from fflin.simulation.lanes import Statistics
 from fflin.simulation.packing import no_law
 from fflin.simulation.plan import Plan
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
@@ -174,10 +175,10 @@ def marks_of(
     )
 
 
-class RunStatistics:
+class RunStatistics(Statistics):
     """Statistics of eight parallel runs in compiled code; see `marks_of`."""
 
-    every, span = 1, LOOK
+    span = LOOK
 
     def __init__(
         self,
@@ -209,7 +210,7 @@ class RunStatistics:
         first = _by_run(self._marks.states[: self._state.nx])
         return self._over(first, errors_of(self._state, self._target, q, v)[1])
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
         """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on, also given as `raw`."""
         take = kernel("loop", "take", "the run statistics")
         take(self._words, raw, first, len(rows[0]))

@@ -13,9 +13,8 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
-from fflin.batch.run import Progress, check_workers, executor_of
-from fflin.campaign.dispersions import Draws
+from fflin.base.validation import Array, FrozenArrays, number, share, whole
+from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
 from fflin.kernel.tree import LANES
@@ -233,39 +232,30 @@ def validity(
     largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
-    check_workers(executor, workers, threads, None, progress)
+    how = Execution(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
-
-    def displaced(levels: Array, streams: Indices, runs: Indices) -> Array:
-        """Return the initial deviations of some runs, each from its own random stream."""
-        x = []
-        for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
-            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-            x.append(loop.displaced(rng, **_scaled(largest, level)))
-        return np.array(x) - loop.start
-
     sets, work = [], []
     # Level and random stream of each run: the runs for the prediction error, then the random runs.
     for predicts, at, streams in (
         (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
         (False, levels, _DIRECTIONS + np.arange(samples)),
     ):
-        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"])
-        starts = partial(displaced, at, streams)
-        sets.append((runs_of, starts, len(at)))
-        job = runs_of()
-        job.choose(engine)  # a wrong argument is refused before anything is compiled
+        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"], engine)
+        starts = np.empty((len(at), len(loop.start)))
+        for start, level, stream in zip(starts, at.tolist(), streams.tolist(), strict=True):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+            start[:] = loop.displaced(rng, **_scaled(largest, level)) - loop.start
+        sets.append((runs_of, starts))
         # A random run usually settles after 1 / PATIENCE of its longest duration.
         long = len(at) if predicts else math.ceil(len(at) / PATIENCE)
-        work.append((job, Draws(starts(np.arange(min(LANES, len(at))))), long))
-    total, done, found = sum(count for *_, count in sets), 0, []
-    with executor_of(executor, workers) as others:
-        how: dict[str, object] = {"executor": others, "workers": workers, "threads": threads}
-        expect(progress, work, others, threads)
-        for runs_of, starts, count in sets:
-            how["progress"] = progress and partial(_report, progress, done, total)
-            found.append(settle(runs_of, starts, count, engine, **how))
-            done += count
+        work.append((runs_of(), starts[:LANES], long))
+    total, done, found = sum(len(starts) for _, starts in sets), 0, []
+    with how:
+        expect(progress, work, how)
+        for runs_of, starts in sets:
+            told = progress and partial(_report, progress, done, total)
+            found.append(settle(runs_of, starts, how, told))
+            done += len(starts)
     predicted, random = found
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])

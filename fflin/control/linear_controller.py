@@ -18,7 +18,7 @@ from fflin.base.record import FORMATS, read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, Policy, Sample, decider, feedback_of
+from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import require_sensed
@@ -161,7 +161,7 @@ class LinearController(Feedback):
         (A, B, C, D, *_), lin = self.system, self.lin
         return Sample(A, B, C, D, lin.u0, lin.y0)
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Loop:
         """Return policy(t, q, v) -> u for a robot; each call returns a policy with its own z.
 
         Raises

@@ -300,7 +300,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
                 "expected the same sample= and the same trajectory for both"
             )
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Loop:
         """Return policy(t, q, v) -> u for a robot; each call returns one with its own estimate.
 
         Raises

@@ -6,7 +6,7 @@ in base axes. Position and linear velocity of the base are left out, because the
 
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-(11.2) of docs/derivation.md, as in `simulation.plant`. H is linear momentum, then angular momentum
+(11.2) of docs/derivation.md, as in `simulation.run`. H is linear momentum, then angular momentum
 about the initial position of the base's origin. Positions are relative to this point.
 """
 

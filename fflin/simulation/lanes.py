@@ -8,9 +8,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN, Progress
 from fflin.base.validation import Array, Indices, Mask, vector
 from fflin.control.linear_controller import LinearController, OutputFeedback
-from fflin.control.policies import Allocation, Gridded, StateFeedback, measured_at
+from fflin.control.policies import Allocation, Gridded, StateFeedback, decider, measured_at
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.kernel import loop
 from fflin.kernel.arguments import laid_out, words_of
@@ -26,8 +25,7 @@ from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_ther
 from fflin.kernel.tree import LANES, batch_tree, work_space
 from fflin.robot.joints import ROOT
 from fflin.simulation.packing import SLOTS, noise_of, packed
-from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Conserved, Plant, conserved_by
+from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Recording, ending_of, go, stop_conditions, stop_of
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
@@ -42,7 +40,6 @@ _FRACTION, _COMPILING = 0.1, 30.0
 _log = logging.getLogger("fflin")
 
 _MEMORY = 2**22  # [bytes] memory for recorded rows
-_SPAN = 4096  # steps between checks for Ctrl-C
 
 # {name of an array of the loop: values of N runs (N, size)}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
@@ -64,19 +61,20 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]
     return at, rows
 
 
-class Statistics(Protocol):
-    """Statistics of eight parallel runs, updated after each slice of steps."""
+class Statistics:
+    """Statistics of eight parallel runs, updated after each slice of steps; here, none."""
 
-    every: int  # steps from one row to the next
-    span: int  # steps between checks of `over`
+    every = 1  # steps from one row to the next
+    span = 4096  # steps between checks of `over`, and for Ctrl-C
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
+        return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
         """Prepare for eight new runs."""
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
         """Add rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
 
         The first row is at step `first`. `raw` (count * width, LANES) contains the values of
@@ -85,6 +83,7 @@ class Statistics(Protocol):
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs after `done` steps; `stop` are indices into STOPS."""
+        return {}
 
 
 class LaneLoop:
@@ -94,18 +93,17 @@ class LaneLoop:
     mass, at the slices `columns`.
     """
 
-    def __init__(self, plan: Plan, plant: Plant, runs: Runs | None = None) -> None:
+    def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
         if runs and "delay" in runs:  # provide space for the largest delay
-            latest = int(runs["delay"].max())
-            plan = replace(plan, times=plan.times._replace(delay=latest))
-        parts, stop = packed(plan, plant), stop_conditions(plan)
+            plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
+        parts, stop = packed(plan), stop_conditions(plan)
         law = parts.law
         if runs and "seed" in runs and len(law.added) == len(law.y):
             law = law._replace(added=np.zeros(SLOTS * len(law.y)))
         if runs:  # all runs are given with a quaternion for which the sign is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign))
-        self._plan, self._state = plan, plant.state
+        self._plan, self._state = plan, plan.plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(law.added) > len(law.y)
         # Laned arrays, each with the column of its initial values.
         self._fresh: list[tuple[Array, Array]] = []
@@ -115,7 +113,7 @@ class LaneLoop:
         self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
         ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
-        self.width, self.steps, self.done = ends[-1], plan.times.steps, 0
+        self.width, self.done = ends[-1], 0
         self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
         self._of_run = {
             **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
@@ -124,15 +122,7 @@ class LaneLoop:
             **robot.faults._asdict(),
         }
 
-    def rows(self, most: int) -> Array:
-        """Return work space for `most` rows, or for fewer rows if they exceed the memory limit."""
-        return work_space(max(1, min(most, _MEMORY // (8 * LANES * self.width))) * self.width)
-
-    def advance(self, clock: Indices, last: int, every: int, rows: Array) -> None:
-        """Advance to the step `last`; see `kernel.loop.advance`."""
-        self._advance(self._words, clock, last, every, rows, self._work)
-
-    def split(self, raw: Array) -> list[Array]:
+    def _split(self, raw: Array) -> list[Array]:
         """Return the recorded arrays, each (rows, LANES, size)."""
         by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
         return [by_row[..., part] for part in self.columns]
@@ -144,30 +134,29 @@ class LaneLoop:
 
         The outcomes of the statistics are written into the rows of `out`.
         """
-        times, every, runs = self._plan.times, statistics.every, runs or {}
-        steps, point = self.steps, self.parts.point
-        count = len(next(iter(out.values())))
+        times, every, point = self._plan.times, statistics.every, self.parts.point
+        steps, count = times.steps, len(next(iter(out.values()))) if out else 1
         of_lane = np.minimum(np.arange(LANES), count - 1)
-        sense = self._begin(runs, of_lane)
+        sense = self._begin(runs or {}, of_lane)
         statistics.reset()
-        space = self.rows(-(-steps // every))
+        most = max(1, min(-(-steps // every), _MEMORY // (8 * LANES * self.width)))
+        space = work_space(most * self.width)
         # A slice of count * every steps contains count recorded steps, wherever it begins.
-        span = min(len(space) // self.width * every, statistics.span)
+        span = min(most * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)
         clock, messages = np.zeros(1, dtype=np.intp), [""] * count
-        going = np.ones(count, dtype=bool)
-        bar = Progress(self._plan.progress)
+        going, bar = np.ones(count, dtype=bool), Progress(self._plan.options.progress)
         try:
-            while clock[0] < steps and going.any():
-                first = int(clock[0])
+            while self.done < steps and going.any():
+                first = self.done
                 last = min(steps, (first // span + 1) * span)
                 sense(first, last)
-                self.advance(clock, last, every, space)
+                self._advance(self._words, clock, last, every, space, self._work)
                 self.done = done = int(clock[0])
                 raw = space[: (-(-done // every) - -(-first // every)) * self.width]
                 if len(raw):
-                    statistics.add(first, self.split(raw), raw)
+                    statistics.add(first, self._split(raw), raw)
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
@@ -224,77 +213,52 @@ class LaneLoop:
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
         """Write into `out` the outcomes of the runs that end at the current step."""
-        count = len(ending)
+        point, kept, count = self.parts.point, self.parts.reference, len(ending)
+        conserved = kept.start[:9] + kept.sums[:9]
+        conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
+        last = np.vstack((point.q, point.nu, self.parts.stages.u, conserved))
         diverged = (stop == STOPS.index("diverged"))[:count]
-
-        def write(chosen: Mask) -> None:
+        for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
+            if finite:  # the last state of a diverged run may not be finite, so it is not added
+                statistics.add(self.done, self._split(last), last)
             found = statistics.outcome(self.done, stop)
             for name, rows in out.items():
                 rows[chosen] = found[name][:count][chosen]
 
-        if (ending & diverged).any():
-            write(ending & diverged)
-        if (ending & ~diverged).any():
-            # The last state is added, except for diverged runs, whose state may not be finite.
-            last = self.last_row()
-            statistics.add(self.done, self.split(last), last)
-            write(ending & ~diverged)
 
-    def last_row(self) -> Array:
-        """Return the row (width, LANES) of the current step."""
-        point, kept = self.parts.point, self.parts.reference
-        conserved = kept.start[:9] + kept.sums[:9]
-        conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
-        return np.vstack((point.q, point.nu, self.parts.stages.u, conserved))
-
-
-class LaneRows:
+class LaneRows(Statistics):
     """Recorded rows of a single run, one for each `every` steps, with the columns of the loop."""
 
-    span = _SPAN
+    def __init__(self, times: Times, width: int) -> None:
+        self.every, self.kept = times.every, np.empty((times.rows, width))
 
-    def __init__(self, loop: LaneLoop, every: int) -> None:
-        self.every, self.kept = every, np.empty((loop.steps // every + 2, loop.width))
-
-    def over(self, q: Array, v: Array) -> Mask:
-        """Return False for each run: no run ends early."""
-        return np.zeros(len(q), dtype=bool)
-
-    def reset(self) -> None:
-        """Prepare for new runs."""
-
-    def add(self, first: int, rows: Sequence[Array], raw: Array | None = None) -> None:
+    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
         """Store rows; see `Statistics`."""
         begin = -(-first // self.every)
         self.kept[begin : begin + len(rows[0])] = np.concatenate(rows, axis=2)[:, 0]
 
-    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the step at which the run ends."""
-        return {"steps": np.full(LANES, float(done))}
 
-
-def recorded(plan: Plan, plant: Plant, runs: Runs | None = None) -> Recording:
+def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     """Simulate a plan, or a single dispersed run of it (`runs`), with the compiled loop."""
-    every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, plant, runs)
-    rows = LaneRows(loop, every)
+    every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, runs)
+    rows = LaneRows(plan.times, loop.width)
     try:
-        [stopped] = loop.fly(rows, {"steps": np.zeros(1)}, runs)
+        [stopped] = loop.fly(rows, {}, runs)
     except KeyboardInterrupt:
         if not loop.done:
             raise
         stopped = f"interrupted at t = {loop.done * dt:g} s"
     if runs is None and not np.isfinite(loop.parts.stages.u).all():
-        # The Python loop raises an error that names the command.
-        return go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
+        return go(plan)  # raises an error that names the command
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
     q, nu, u, momentum, center = (rows.kept[:count, part] for part in loop.columns)
-    v = plant.state.spread(nu)
+    v = plan.plant.state.spread(nu)
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 
 
-def engine_of(engine: object, plan: Plan, plant: Plant, *, many: bool = False) -> str:
+def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     """Return the requested engine for a plan, or choose an engine.
 
     Many runs use the compiled loop if it supports the plan. A single run uses it only if the run is
@@ -302,61 +266,52 @@ def engine_of(engine: object, plan: Plan, plant: Plant, *, many: bool = False) -
     """
     if checked_engine(engine) == "python":
         return "python"
-    reason = _reason(plan, plant)
-    if engine == "compiled":
-        if reason:
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
-        return "compiled"
-    wanted = many or (plan.times.steps > LONG and is_kept("loop", "advance"))
+    reason = _reason(plan)
+    if engine == "compiled" and reason:
+        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
+    wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
     return "compiled" if wanted and not reason else "python"
 
 
-def _reason(plan: Plan, plant: Plant) -> str:
+def _reason(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
-    policy, robots = plan.policy, [plant.robot]
+    plant, policy, robots = plan.plant, decider(plan.policy), [plan.plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"
-    if plan.events or plan.callback or plant.disturbance or plant.field:
+    if plan.events or plan.options.callback or plant.disturbance or plant.field:
         return "events, callbacks, disturbances and the field of an orbit are computed in Python"
-    if isinstance(policy, Allocation):
-        robots.append(policy.design)
-        policy = policy.policy
+    if isinstance(plan.policy, Allocation):
+        robots.append(plan.policy.design)
     known = type(policy) in _KNOWN or isinstance(policy, Gridded)
     if policy is not None and not known:
         return f"a {type(policy).__name__} is computed in Python"
-    if reason := _unmeasured(plan, plant, policy):
-        return reason
     for robot in robots:
         at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         if batch_tree(robot) is None or not at_home:
             return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
-    return ""
+    return _unmeasured(plan, policy) if isinstance(policy, _OF_OUTPUTS) else ""
 
 
-def _unmeasured(plan: Plan, plant: Plant, policy: object) -> str:
+def _unmeasured(plan: Plan, policy: LinearController | TrajectoryOutputFeedback) -> str:
     """Return why the compiled loop cannot evaluate a plan's compensator, or an empty text."""
-    if not isinstance(policy, _OF_OUTPUTS):
-        return ""
     dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
     if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
         return "its sample time differs from the compensator's"
     if policy.noise is not None and not plan.times.sample:
         return "noise is evaluated at every stage of every step"
     try:
-        measured_at(plant.state)
+        measured_at(plan.plant.state)
     except InputError as error:
         return str(error)
     return ""
 
 
-def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
-    """Simulate a plan with an engine; `plant` and `conserved` belong to the simulated robot."""
+def carried_out(plan: Plan, engine: str) -> Recording:
+    """Simulate a plan with an engine."""
     if engine == "compiled":
-        return recorded(plan, plant)
-    began, slower = time.perf_counter(), not _reason(plan, plant)
-    run = go(plan, plant, conserved, "(faster: --engine compiled) " if slower else "")
+        return recorded(plan)
+    began, slower = time.perf_counter(), not _reason(plan)
+    run = go(plan, "(faster: --engine compiled) " if slower else "")
     spent = time.perf_counter() - began
     if spent > LONG_RUN and slower:
         once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"

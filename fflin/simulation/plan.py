@@ -1,48 +1,65 @@
-"""The checked plan of a simulation: start, times, limits, method and events."""
+"""The checked plan of a simulation: start, time steps, limits, method and events."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
-from fflin.base.validation import Array, instance, truth, vector
+from fflin.base.validation import Array, instance, number, truth, vector, whole
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
-from fflin.control.linear_controller import growing
-from fflin.control.policies import axes_of, bound, fed_back, feedback_of
-from fflin.control.tracking import Reference, followed, reference_of, tracking_of
+from fflin.control.linear_controller import LinearController, closed_loop, growing
+from fflin.control.policies import StateFeedback, axes_of, bound, decider, fed_back, feedback_of
+from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
-from fflin.dynamics.integrators import Integrator, integrator
+from fflin.dynamics.integrators import held_exponential, integrator
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import Range, chosen_limits
+from fflin.robot.fields import chosen_limits
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Disturbance, Plant
-from fflin.simulation.prediction import Predictor, predictor
-from fflin.simulation.times import Times, times_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
-Limits: TypeAlias = "float | str | Mapping[str, Any] | Sequence[Any]"
+Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
+# Bounds of an automatic duration [s], and the time step [s] of the linear loop that determines it.
+SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
+LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
+_STEP = 0.01  # [s]
 # If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
 _BEFORE = 1e-6
+_MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
+# If the step is chosen automatically, a larger number of steps than the first causes a warning
+# (half a minute of computing). A larger number than the second is refused (some hours).
+_MANY_STEPS, _ENDLESS = 50_000, 10_000_000
+# With more rows than the first number, only some steps are recorded, in about as many rows as the
+# second.
+_MANY_ROWS, _FEW_ROWS = 100_000, 10_000
+_FOREVER = 1e100  # [s]; its inverse squared does not underflow
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulationOptions:
-    """Options of a simulation as they are given; see `simulate` for the meaning of each."""
+    """Arguments of `simulate` as they are given; see there for the meaning of each."""
 
+    robot: Robot
+    policy: object = None
     x0: ArrayLike | None = None
     q0: ArrayLike | None = None
     v0: ArrayLike | None = None
@@ -62,68 +79,126 @@ class SimulationOptions:
     reference: pin.SE3 | None = None
     every: int | None = None
     progress: bool | None = None
+    engine: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Checked plan of a simulation, which does not change during the run."""
+class Times(NamedTuple):
+    """The step `dt` [s], the number of steps, and sample time, delay and rows in steps."""
 
-    q: Array  # (nq,)
-    v: Array  # (nv,)
-    times: Times
-    policy: Any  # policy of the law
-    law: Law | None  # without a law, only `initial` acts
-    initial: Array  # (nu,) inputs until the first command arrives
-    limits: Saturation  # limits of the inputs
-    wheels: list[int]  # indices in v of the wheels with a speed limit
-    known: dict[str, Range]  # all limits of states and inputs, including reported ones
-    method: type[Integrator]
-    project: bool  # whether momentum and centre of mass are projected; false in orbit
-    turning: Array  # indices in v of the velocities whose rotation per step is bounded
-    chart: StateMap | None  # the run ends when the base leaves this chart
-    events: tuple[Event, ...]
-    callback: Callback | None
-    progress: bool | None  # whether a bar is shown; None shows it if the run takes long
-    near: Array | None  # state (nx,) from which continuous joints count turns
-    target: Array | None  # target state (nx,), if known
-    reference: Reference | None  # followed motion, if any
-    steered: tuple[str, ...]  # states that are known to be fed back
-    notes: Callable[[], tuple[str, ...]]  # computes the notes of the report
-    predictor: Predictor | None  # prediction of the linear motion under the same law
+    dt: float
+    steps: int
+    every: int  # steps between recorded rows
+    sample: int  # steps between samples of the law; 0 if it is evaluated at all stages
+    delay: int  # steps from a sample to its effect
+    fastest: float  # largest magnitude of the loop's poles [1/s]; 0 if unknown
+    thinned: bool  # whether `every` was chosen automatically
 
     @property
-    def last_node(self) -> float:
-        """Time of the last stage as a fraction of the step; below 1 if inputs jump at knots."""
-        return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
+    def rows(self) -> int:
+        """Largest number of recorded rows."""
+        return self.steps // self.every + 2
 
-    def channel(self) -> Channel | None:
-        """Return the channel of the law's commands to the inputs, without pending commands."""
-        if self.law is None:
-            return None
-        return Channel(
-            self.law,
-            self.initial,
-            self.limits,
-            self.times.sample,
-            self.times.delay,
-            lambda t, q, v: v[self.wheels],
+    @property
+    def slow(self) -> float:
+        """Square of the largest angular velocity for which rotations per step are small enough."""
+        return float((LARGEST_TURN / self.dt) ** 2)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the recorded rows, for the report."""
+        notes, every, sample = list[str](), self.every, self.sample
+        if self.thinned:
+            said = f"one in {every} steps is recorded; every=1 (--every 1) records all "
+            notes.append(f"{said}{self.steps:,} steps")
+        if sample and every % sample and sample % every:
+            said = f"a row is recorded every {every} steps, but the controller samples every "
+            notes.append(f"{said}{sample} steps, so the rows are not a valid trajectory")
+        return tuple(notes)
+
+
+class Plan:
+    """Checked plan of `simulate` with some arguments; it does not change during the run."""
+
+    def __init__(self, options: SimulationOptions) -> None:
+        robot, policy = options.robot, followed(options.policy, options.robot)
+        self.options = options
+        self.times = times = times_of(policy, options)
+        policy = followed(policy, robot, held=times.sample * times.dt)
+        state = _state_of(policy, options)
+        self.plant = plant = Plant(state, options.disturbance)
+        self.policy: object = policy
+        self.method = integrator(options.method)
+        if times.fastest * times.dt > self.method.reach:
+            raise InputError(
+                f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
+                f"{times.fastest:.4g} 1/s; take at most {self.method.reach / times.fastest:.2g} s, "
+                "or give `sample`"
+            )
+        follows, (lin, _) = reference_of(policy), feedback_of(policy)
+        default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
+        # Initial configuration (nq,) and velocity (nv,).
+        self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)
+        points.require_slow("the initial velocity", self.v)
+        if plant.field:
+            plant.field.require_near(self.q)
+        _require_room(times, state, chosen=options.dt is None)
+        expected = "a list of functions event(t, q, v)"
+        self.events = tuple(instance("events", options.events, Sequence, expected))
+        for each in self.events if options.callback is None else (*self.events, options.callback):
+            if not callable(each):
+                raise InputError(
+                    f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
+                )
+        # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
+        acting, self.known = chosen_limits(robot, options.limits)
+        self.limits = saturation(
+            robot, acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
+        # Without a law, only `initial` acts: the inputs (nu,) until the first command arrives.
+        self.law = law_of(policy, plant, self.limits, times)
+        self.initial = _initial_inputs(policy, plant, self.limits)
+        # Target state (nx,), if known, or followed motion.
+        self.target = target_of(state, lin if options.target is None else options.target)
+        self.reference = follows if options.target is None else None
+        # State (nx,) from which continuous joints count turns.
+        self.near = self.target
+        if options.x0 is not None:
+            self.near = np.asarray(options.x0, dtype=float)
+        elif self.reference:
+            self.near = state.read(*self.reference(0.0)[:2])
+        # In orbit, momentum and centre of mass are not projected.
+        self.project = truth("project", options.project) and robot.orbit is None
+        # Indices in v of the rotation rates of the base and of all joints except rotors: their
+        # rotation within a step is bounded. Nothing depends on the angle of a rotor.
+        rotors, joints = rotor_names(robot), robot.joints
+        turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
+        self.turning = np.array([3, 4, 5, *turning])
+        # Indices in v of the wheels with a speed limit.
+        self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
+        self.charted = lin is not None  # the run ends when the base leaves the chart of the state
+        self.steered = fed_back(policy)  # states that are known to be fed back
+        self.notes = (*growing(policy), *times.notes)  # for the report
+        # Time of the last stage as a fraction of the step, earlier if inputs jump at knots.
+        self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
+
+    def replace(self, **changes: object) -> Plan:
+        """Return the plan with other attributes."""
+        other = copy(self)
+        vars(other).update(changes)
+        return other
+
+    def channel(self, law: Callable[..., Array], speeds: Callable[..., Array]) -> Channel:
+        """Return the channel of a law's commands to the inputs, without pending commands."""
+        times = self.times
+        return Channel(law, self.initial, self.limits, times.sample, times.delay, speeds)
 
 
-def start_of(
-    state: StateMap, options: SimulationOptions, reference: Reference | None
-) -> tuple[Array, Array]:
-    """Return the initial configuration (nq,) and velocity (nv,)."""
-
-    def default() -> tuple[Array, Array]:
-        if reference:
-            q, v, _ = reference(0.0)
-            return q.copy(), v.copy()
-        return points.start_of(state.robot)
-
-    q, v = points.point_of(state, options.x0, options.q0, options.v0, default)
-    points.require_slow("the initial velocity", v)
-    return q, v
+def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
+    """Bind the policy to the robot; return the law, which checks the policy's commands."""
+    if policy is None:
+        return None
+    within = (limits.low, limits.high)
+    return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
 def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
@@ -152,73 +227,9 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
     return goal
 
 
-def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot; return the law, which checks the policy's commands."""
-    if policy is None:
-        return None
-    within = (limits.low, limits.high)
-    return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
-
-
-def planned(robot: Robot, policy: object, options: SimulationOptions) -> tuple[Plan, Plant]:
-    """Return the checked plan of `simulate` with these options, and the plant."""
-    policy = followed(policy, robot)
-    times = times_of(policy, options)
-    policy = followed(policy, robot, held=times.sample * times.dt)
-    lin, _ = feedback_of(policy)
-    follows = reference_of(policy)
-    state = _state_of(robot, policy, options)
-    plant = Plant(state, options.disturbance)
-    foresees = predictor(plant, policy, options.linear)
-    method = integrator(options.method)
-    if times.fastest * times.dt > method.reach:
-        raise InputError(
-            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
-            f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
-            "give `sample`"
-        )
-    q, v = start_of(state, options, follows)
-    if plant.field:
-        plant.field.require_near(q)
-    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=options.dt is None)
-    acting, known = chosen_limits(robot, options.limits)
-    within = saturation(robot, acting, q, times.dt, times.sample, pulsed=policy is not None)
-    law = law_of(policy, plant, within, times)
-    target = options.target
-    follows = follows if target is None else None
-    goal = target_of(state, lin if target is None else target)
-    initial = _initial_inputs(policy, plant, within)
-    near = state.read(*follows(0.0)[:2]) if follows else goal
-    plan = Plan(
-        q=q,
-        v=v,
-        times=times,
-        policy=policy,
-        law=law,
-        initial=initial,
-        limits=within,
-        wheels=[robot.joint(name).idx_v for name in within.wheel_names],
-        known=known,
-        method=method,
-        project=truth("project", options.project) and robot.orbit is None,
-        turning=_rotating(robot),
-        chart=None if lin is None else state,
-        events=_checked_functions(options.events, options.callback),
-        callback=options.callback,
-        progress=options.progress,
-        near=near if options.x0 is None else np.asarray(options.x0, dtype=float),
-        target=goal,
-        reference=follows,
-        steered=fed_back(policy),
-        notes=lambda: (*growing(policy), *times.notes),
-        predictor=foresees,
-    )
-    return plan, plant
-
-
-def _state_of(robot: Robot, policy: object, options: SimulationOptions) -> StateMap:
+def _state_of(policy: object, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion, with the frame and reference of its policy if known."""
-    frame, reference = options.frame, options.reference
+    robot, frame, reference = options.robot, options.frame, options.reference
     lin, _ = feedback_of(policy)
     own_frame, own_reference = axes_of(policy)
     if lin is not None and (frame is not None or reference is not None):
@@ -242,40 +253,137 @@ def _state_of(robot: Robot, policy: object, options: SimulationOptions) -> State
     return StateMap(robot, reference=reference, frame=own_frame if frame is None else frame)
 
 
-def _initial_inputs(policy: Any, plant: Plant, limits: Saturation) -> Array:
+def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
     """Return the inputs (nu,) before the first command; warn if they exceed the limits."""
-    robot, actuation, (lin, _) = plant.robot, plant.actuation, feedback_of(policy)
-    along = tracking_of(policy)
+    actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
     # With allocation, the inputs of the policy's model are not the inputs of the robot.
     if lin is not None and lin.input_names == actuation.names:
-        where, inputs, initial = "at its target", lin.u0[None], np.asarray(lin.u0)
-    elif along is policy is not None:
+        where, inputs, initial = "at its target", lin.u0[None], lin.u0
+    elif along is not None and along is policy:
         where, inputs = "on its trajectory", along.trajectory.u_base
         initial = along.reference(0.0)[2]
     else:
         return np.zeros(len(limits.low))
     units = dict(zip(actuation.names, actuation.units, strict=True))
-    warn_beyond(robot.name, where, units, inputs, limits.low, limits.high)
+    warn_beyond(plant.robot.name, where, units, inputs, limits.low, limits.high)
     return initial
 
 
-def _checked_functions(events: Sequence[Event], callback: Callback | None) -> tuple[Event, ...]:
-    """Return the events; raise `InputError` if an event or the callback is not a function."""
-    called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
-    for each in called if callback is None else (*called, callback):
-        if not callable(each):
-            raise InputError(
-                f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
-            )
-    return called
+def times_of(policy: object, options: SimulationOptions) -> Times:
+    """Return the times of a simulation from the options and the policy."""
+    duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
+    follows = tracking_of(policy)
+    if sample is not None:
+        sample = _positive("sample", sample)
+    else:
+        by = decider(policy)
+        made = by if hasattr(by, "dt") else getattr(policy, "lin", None)
+        sample = getattr(follows.schedule if follows else made, "dt", None) or None
+    fastest = 0.0
+    if not sample and follows:
+        fastest = largest_rate(follows.schedule)
+    elif not sample and (closed := closed_loop(policy)) and not closed[1]:
+        fastest = float(np.abs(np.linalg.eigvals(closed[0])).max())
+    if duration is None and follows is None:
+        raise InputError("the duration is missing; give duration= in s")
+    duration = _positive("duration", follows.duration if follows and duration is None else duration)
+    delay = number("delay", options.delay)
+    if not 0.0 <= delay < duration:
+        raise InputError(
+            f"delay is {delay:g} s, expected at least 0 and less than the duration of "
+            f"{duration:g} s, so that a command takes effect"
+        )
+    if dt is None:
+        dt = _STEP if fastest * _STEP <= 1.0 else float(0.5 ** np.ceil(np.log2(fastest)))
+        if sample or delay:
+            dt = _part_of(sample or delay, dt, duration, delay)
+    dt = _positive("the step dt", dt)
+    steps = max(1, round(duration / dt))
+    if abs(steps * dt - duration) > 1e-6 * duration:
+        if sample or delay:
+            _in_steps("duration", duration, dt)  # raises an error
+        steps = int(np.ceil(duration / dt))
+        dt = duration / steps
+    if sample is None:
+        sample = dt if delay else 0.0
+    samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
+    thinned, part = every is None and steps > _MANY_ROWS, max(samples, 1)
+    # Rows of a sampled loop are at its samples.
+    few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
+    every = few if every is None else whole("every", every, 1)
+    return Times(dt, steps, every, samples, late, fastest, thinned)
 
 
-def _rotating(robot: Robot) -> Array:
-    """Return the indices in v of the rotation rates of the base and of all joints except rotors.
+def _require_room(times: Times, state: StateMap, *, chosen: bool) -> None:
+    """Raise an error for too many rows or steps; warn of many automatically `chosen` steps."""
+    dt, steps, rows, fastest = times.dt, times.steps, times.rows, times.fastest
+    width = state.robot.nq + state.robot.nv + 2 * state.nx
+    if rows * width > _MOST_ENTRIES or steps > (_ENDLESS if times.thinned else _MOST_STEPS):
+        raise InputError(
+            f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {rows:.3g} rows, "
+            "which is too many; use a larger dt or `every`, or a slower gain if a fast pole of the "
+            "loop requires this step"
+        )
+    if chosen and fastest * _STEP > 1.0 and steps > _MANY_STEPS:
+        warnings.warn(
+            f"the simulation takes long, because the fastest pole of the loop at {fastest:.3g} 1/s "
+            f"requires {steps:,} steps of {dt:.3g} s; give dt=, sample= or a slower gain",
+            FflinWarning,
+            stacklevel=3,
+        )
 
-    The rotation of the base and of these joints within a step is bounded. Rotors may spin fast,
-    because nothing depends on their angle.
+
+def _in_steps(name: str, time: float, dt: float) -> int:
+    """Convert a time [s] to a number of steps; raise `InputError` unless it is a multiple of dt."""
+    if abs(round(time / dt) * dt - time) > 1e-6 * dt:
+        raise InputError(
+            f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
+            "choose dt accordingly"
+        )
+    return round(time / dt)
+
+
+def _part_of(sample: float, largest: float, *times: float) -> float:
+    """Return a step that divides the sample time and, if possible, the other times."""
+    least = int(np.ceil(sample / largest))
+    for parts in range(least, least + 1000):
+        dt = sample / parts
+        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
+            return dt
+    return sample / least
+
+
+def _positive(name: str, value: object) -> float:
+    time = number(name, value)
+    if not 1.0 / _FOREVER < time <= _FOREVER:
+        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s")
+    return time
+
+
+def time_to_settle(
+    robot: Robot, policy: StateFeedback | LinearController, q: Array, v: Array | None
+) -> float:
+    """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
+
+    The time is rounded up to tens of seconds.
     """
-    rotors = rotor_names(robot)
-    joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
-    return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])
+    lin, closed = policy.lin, closed_loop(policy)
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
+    assert closed is not None
+    loop, dt, _ = closed
+    step = dt or _LOOK
+    if not dt:
+        loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
+    history = np.zeros((math.ceil(LONGEST / step) + 1, len(loop)))
+    history[0, : len(lin.x0)] = start[[state.names.index(x) for x in lin.state_names]] - lin.x0
+    for row, after in pairwise(history):
+        after[:] = loop @ row
+    away, wheels = np.zeros(len(history), dtype=bool), {f"q_m.{name}" for name in robot.wheels}
+    for group in ("q_b", "r_b", "q_m"):
+        judged = {name for name in fed_back(policy) if group_of(name) == group} - wheels
+        of = [i for i, name in enumerate(lin.state_names) if name in judged]
+        error = np.abs(history[:, of]).max(axis=1, initial=0.0)
+        away |= error > 0.01 * error.max()
+    last = float(np.flatnonzero(away).max(initial=0)) * step
+    return max(SHORTEST, 10.0 * math.ceil(last / 10.0)) if last < 0.99 * LONGEST else SHORTEST

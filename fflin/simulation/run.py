@@ -1,28 +1,176 @@
-"""The simulation loop over a plan, with the recording of its rows."""
+"""The simulation loop in Python: steps of a plan, their records, and the conserved quantities.
+
+Without external forces the momentum about a fixed point is constant, and the centre of mass moves
+along r_c(t) = r_c(0) + p t / m. In orbit the Jacobi integral (14.3) is conserved instead.
+"""
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
+from scipy.linalg.lapack import dposv
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
+from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.control.channel import Channel
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
-from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Conserved, MomentumReference, Plant
-from fflin.simulation.times import LARGEST_TURN
-
-# Function that takes one step from (t, q, v) with initial inputs u; returns q and v at the end.
-Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
+from fflin.robot.joints import ROOT
+from fflin.simulation.plan import LARGEST_TURN, Plan
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
 _LOOK = 16  # steps between checks of the clock
 _LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the number
+
+_crba, _placement = pin.crba, pin.XYZQUATToSE3
+
+
+class Histories(NamedTuple):
+    """Histories of energy, of momentum about the centre of mass, and of the centre of mass."""
+
+    energy: Array  # (N,)
+    momentum: Array  # (N, 6)
+    center: Array  # (N, 3)
+    kept: Array  # (N, 6) momentum about the point; in orbit, the Jacobi integral and zeros
+    scale: Array  # (2,) bounds (11.5) of the linear and the angular part of `kept`
+
+
+class Conserved:
+    """Momentum (linear, then angular about a fixed point, in world axes), and centre of mass.
+
+    Both follow from the initial state and the external impulse, step by step (11.2). In orbit, the
+    Jacobi integral, its first entry, takes the place of the momentum, and the work that of the
+    impulse.
+    """
+
+    momentum: Array  # (6,) after the steps so far
+    wrenches: tuple[Array, ...]  # (6,) about the point for each stage; the caller writes them
+
+    # The fixed point is the initial position of the base. About the world's origin, digits would be
+    # lost if the robot were far away from it.
+
+    def __init__(self, plan: Plan) -> None:
+        robot, start = plan.plant.robot, plan.q[:3]
+        self._robot, self._model, self.mass = robot, robot.model, robot.mass
+        self._field, self._stored = plan.plant.field, robot.stored_momentum
+        self._data = data = robot.create_data()
+        self._M = data.M[:6]  # CRBA writes into it
+        self._M_bb = self._M[:, :6]
+        self._start = np.concatenate((start, np.zeros(4)))
+        self._x, self._y, self._z = start.tolist()  # numbers are faster than arrays
+        self._root = robot.model.jointPlacements[ROOT]
+        self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
+        self._free = self._root.isIdentity(0.0)
+        history, per_mass = self.histories(plan.q[None], plan.v[None]), 1.0 / robot.mass
+        self.momentum = self._momentum = history.kept[0]
+        self._center = history.center[0]
+        # Position and velocity of the centre of mass without external forces, as columns.
+        self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
+        self._time = np.ones(2)
+        # Rows: the impulse; the displacement that the impulse causes; the wrenches of a step.
+        # Without external forces all rows are exactly zero.
+        method, h = plan.method, plan.times.dt
+        self._stack = np.zeros((2 + len(method.weights), 6))
+        self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
+        weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
+        self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
+
+    def wrench(self, q: Array, push: Array) -> Array:
+        """Return the wrench (6,) of a plant's push and gravity about the point, in world axes."""
+        if self._field:
+            return push
+        base = _placement(q[:7] - self._start)
+        total: Array = (base if self._free else self._root * base).toDualActionMatrix().dot(push)
+        if self._weight is not None:
+            near = q.copy()
+            near[:7] -= self._start
+            com = pin.centerOfMass(self._model, self._data, near, False)
+            total[:3] += self._weight
+            total[3:] += skew(com).dot(self._weight)
+        return total
+
+    def advance(self) -> None:
+        """Advance by a step under the wrenches that were written for its stages."""
+        self._sums[:] = impulse, displacement = self._after.dot(self._stack)
+        self.momentum = self._momentum + impulse
+        self._line[:, 0] = self._center + displacement[:3]
+
+    def center(self, t: float) -> Array:
+        """Return the centre of mass (3,) relative to the point."""
+        self._time[1] = t
+        position: Array = self._line.dot(self._time)
+        return position
+
+    def impose(self, t: float, q: Array, v: Array) -> None:
+        """Set the base's position in `q` and velocity in `v` by centre of mass and momentum."""
+        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Only the deviation of the
+        # momentum is solved for, so rounding errors are relative to this small correction. M is in
+        # base axes, so it does not depend on the base's position.
+        momentum = self.momentum
+        _crba(self._model, self._data, q)
+        if self._stored:
+            pin.forwardKinematics(self._model, self._data, q)
+            momentum = momentum.copy()
+            momentum[3:] -= self._of_wheels()
+        base = _placement(q[:7])
+        if not self._free:
+            base = self._root * base
+        base.translation = self.center(t)
+        # The off-diagonal block of M_bb is -m [c]x.
+        position = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
+        base.translation = position
+        x, y, z = (position if self._free else self._root.actInv(position)).tolist()
+        q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z
+        lack: Array = momentum.dot(base.toActionMatrix()) - self._M.dot(v)
+        v_b = v[:6]
+        v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
+
+    def histories(self, q: Array, v: Array) -> Histories:
+        """Return the conserved quantities at each row of q (N, nq) and v (N, nv)."""
+        model, data, robot = self._model, self._data, self._robot
+        rows, near = len(q), q.copy()
+        near[:, :7] -= self._start
+        energy, center, potential = np.empty(rows), np.empty((rows, 3)), np.zeros(rows)
+        momentum, polar = np.empty((rows, 6)), np.empty(rows)
+        for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
+            energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
+            pin.ccrba(model, data, q_i, v_i)
+            # The momentum of CCRBA is summed about the origin and has larger rounding errors.
+            momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
+            center[i] = data.com[0]
+            polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
+            if self._stored:
+                momentum[i, 3:] += self._of_wheels()
+            if self._field:
+                pin.forwardKinematics(model, data, q[i])
+                potential[i] = self._field.potential(data)
+        sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
+        scale = sizes.max(axis=0)
+        scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        if self._weight is not None:
+            energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
+        stiffness, _, rest = robot.springs
+        if stiffness.any():
+            positions = [[joint.value(q_i) for joint in robot.joints] for q_i in q]
+            energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
+        p, about_center = np.split(momentum, 2, axis=1)
+        kept = np.hstack((p, about_center + np.cross(center, p)))
+        if self._field:
+            scale = np.array([(np.abs(energy) + np.abs(potential)).max(), 0.0])
+            energy += potential
+            kept = np.column_stack((energy, np.zeros((rows, 5))))
+        return Histories(energy, momentum, center, kept, scale)
+
+    def _of_wheels(self) -> Array:
+        """Return the stored momentum (3,) at the last evaluated link poses, in world axes."""
+        total: Array = np.zeros(3)
+        for joint, stored in self._stored:
+            total += self._data.oMi[joint].rotation @ stored
+        return total
 
 
 class Recording(NamedTuple):
@@ -41,109 +189,82 @@ class Recording(NamedTuple):
 
 # A diverging motion overflows before it is stopped, so NumPy need not warn.
 @np.errstate(over="ignore", invalid="ignore")
-def go(plan: Plan, plant: Plant, conserved: Conserved, hint: str = "") -> Recording:
-    """Simulate a plan in Python; `plant` and `conserved` belong to the simulated robot.
+def go(plan: Plan, hint: str = "") -> Recording:
+    """Simulate a plan in Python; the progress bar of a long run shows `hint`."""
+    plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
+    dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
+    channel = None if law is None else plan.channel(law, lambda t, q, v: v[plan.wheels])
+    ask = channel.ask if channel and channel.continuous else None
+    take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
+    follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
+    pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt
+    ends = np.cumsum([len(q), len(v), len(plan.initial), 6])
+    rows, at, t, stages = np.empty((times.rows, ends[-1] + 3)), list[float](), 0.0, 0
 
-    The progress bar of a long run shows `hint`.
-    """
-    times, q, v = plan.times, plan.q, plan.v
-    dt, channel = times.dt, plan.channel()
-    reference = MomentumReference(conserved, plan.method, dt, q, v)
-    advance = _advance(plan, plant, conserved, reference, channel)
-    rows = tuple(
-        np.empty((times.rows, size)) for size in (1, len(q), len(v), len(plan.initial), 6, 3)
-    )
-    count = 0
+    def record() -> None:
+        rows[len(at)] = np.concatenate((q, v, u, kept.momentum, kept.center(t)))
+        at.append(t)
+        if callback:
+            callback(t, q.copy(), v.copy(), u.copy())
 
-    def record(t: float, u: Array) -> None:
-        nonlocal count
-        values: tuple[Array | float, ...] = t, q, v, u, reference.momentum, reference.center(t)
-        for row, value in zip(rows, values, strict=True):
-            row[count] = value
-        count += 1
-        if plan.callback is not None:
-            plan.callback(t, q.copy(), v.copy(), u.copy())
+    def acceleration(t: float, q: Array, v: Array) -> Array:
+        nonlocal stages
+        # At the first stage, u is already the policy's command.
+        a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
+        if pushed:
+            kept.wrenches[stages][:] = wrench(q, push)
+        stages += 1
+        if follow:
+            follow(weights[stages - 1, : stages + 1], stages == len(weights))
+        return a
 
-    step, stopped, project, bar = 0, "", plan.project, Progress(plan.progress)
-    ending = ending_of(plan, stop_conditions(plan))
+    stopped, ending, bar = "", ending_of(plan), Progress(plan.options.progress)
     try:
         for step in range(times.steps):
-            t = step * dt
-            u = plan.initial if channel is None else channel.begin(step, t, q, v)
+            u = channel.begin(step, t, q, v) if channel else plan.initial
             if step % times.every == 0:
-                record(t, u)
-            q, v = advance(t, q, v, u)
+                record()
+            stages, last = 0, t + latest
+            q, v = take(acceleration, t, q, v)
+            if pushed:
+                kept.advance()
             t = (step + 1) * dt
             if project:
-                conserved.impose(q, v, reference.momentum, reference.center(t))
+                kept.impose(t, q, v)
             if stopped := ending(t, q, v):
                 break
             if step % _LOOK == 0:
                 bar(step + 1, times.steps, hint=hint)
     except KeyboardInterrupt:
-        if not count:
+        if not at:
             raise
         stopped = f"interrupted at t = {step * dt:g} s"
     finally:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
-        record(t, u)
-    t_of, q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
-    return Recording(t_of[:, 0], q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
-
-
-def _advance(
-    plan: Plan,
-    plant: Plant,
-    conserved: Conserved,
-    reference: MomentumReference,
-    channel: Channel | None,
-) -> Advance:
-    """Return the function that takes one step."""
-    take = plan.method(plant.robot.model, plan.times.dt).step
-    ask = channel.ask if channel is not None and channel.continuous else None
-    pushed = not plant.isolated(driven=channel is not None)
-    stage, wrench, wrenches = plant.stage, conserved.wrench, reference.wrenches
-    latest = plan.last_node * plan.times.dt
-    follow, weights = plan.law and plan.law.advance, plan.method.step_weights(plan.times.dt)[1]
-
-    def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        stages, last = 0, t + latest
-
-        def f(t: float, q: Array, v: Array) -> Array:
-            nonlocal stages
-            # At the first stage, u is already the policy's command.
-            a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
-            if pushed:
-                wrenches[stages][:] = wrench(q, push)
-            stages += 1
-            if follow:
-                follow(weights[stages - 1, : stages + 1], stages == len(weights))
-            return a
-
-        end = take(f, t, q, v)
-        if pushed:
-            reference.advance()
-        return end
-
-    return asked
+        record()
+    q_of, v_of, u_of, momentum, center = np.split(rows[: len(at)], ends, axis=1)
+    found = np.array(at), q_of, v_of, u_of, momentum, center
+    return Recording(*found, step + 1, stopped, "python")
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
     """Return the stop conditions of a run, with squared rates in the order of v (nv,)."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
-    squares[plan.turning] = (LARGEST_TURN / plan.times.dt) ** 2
-    sign = float(np.sign(plan.chart.scalar(plan.q))) if plan.chart else 0.0
+    squares[plan.turning] = plan.times.slow
+    sign = float(np.sign(plan.plant.state.scalar(plan.q))) if plan.charted else 0.0
     return StopConditions(squares=squares, sign=[sign])
 
 
-def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
+def ending_of(
+    plan: Plan, stop: StopConditions | None = None
+) -> Callable[[float, Array, Array], str]:
     """Build a function that returns why a run ends, or an empty text if the run continues."""
+    stop = stop or stop_conditions(plan)
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])
-    turned = plan.chart.origin_quaternion if plan.chart else (0.0, 0.0, 0.0, 1.0)
-    origin = [0.0, 0.0, 0.0, *map(float, turned)]
+    origin = [0.0, 0.0, 0.0, *plan.plant.state.origin_quaternion.tolist()]
 
     def ending(t: float, q: Array, v: Array) -> str:
         place, rates = q.tolist(), v.tolist()

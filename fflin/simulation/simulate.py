@@ -1,30 +1,35 @@
-"""Simulation of the nonlinear robot on the manifold, under any policy."""
+"""Simulation of the nonlinear robot on the manifold, under any policy, with a linear prediction."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.control.policies import Policy, StateFeedback
+from fflin.base.validation import Array, instance
+from fflin.control.linear_controller import LinearController
+from fflin.control.policies import Compensation, Policy, StateFeedback
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import carried_out, engine_of
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions, planned
-from fflin.simulation.plant import Conserved, Disturbance, Plant, conserved_by
-from fflin.simulation.prediction import predict
-from fflin.simulation.run import Recording
+from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
+from fflin.simulation.plant import Disturbance
+from fflin.simulation.run import Conserved, Recording
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.control.gain_schedule import GainSchedule
+
+# Linear model that predicts a motion, and the command (nu,) for a deviation (nx,) from its point.
+# In the deviation, the robot's states come first, then those of a continuous-time controller.
+Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
 
 def simulate(
@@ -187,32 +192,10 @@ def simulate(
     >>> motion.u.shape[1], float(motion.t[-1])
     (9, 5.0)
     """
-    options = SimulationOptions(
-        x0=x0,
-        q0=q0,
-        v0=v0,
-        duration=duration,
-        dt=dt,
-        method=method,
-        project=project,
-        sample=sample,
-        delay=delay,
-        limits=limits,
-        disturbance=disturbance,
-        events=events,
-        callback=callback,
-        linear=linear,
-        target=target,
-        frame=frame,
-        reference=reference,
-        every=every,
-        progress=progress,
-    )
-    plan, plant = planned(robot, policy, options)
+    plan = Plan(SimulationOptions(**locals()))
+    foresees = predictor(plan)
     try:
-        conserved = conserved_by(plant.robot, plan.q, plant.field)
-        run = carried_out(plan, plant, conserved, engine_of(engine, plan, plant))
-        return motion_of(plan, plant, conserved, run)
+        return motion_of(plan, carried_out(plan, engine_of(engine, plan)), foresees)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "
@@ -220,9 +203,9 @@ def simulate(
         ) from None
 
 
-def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) -> Motion:
-    """Return the motion of a run of a plan."""
-    state, robot = plant.state, plant.robot
+def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
+    """Return the motion of a run of a plan, with a prediction if a predictor is given."""
+    plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
@@ -230,15 +213,17 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
     if plan.reference is not None:
         q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
         target = state_history(state, q, v, plan.near, run.t)
-    history = conserved.histories(run.q, run.v)
+    history = Conserved(plan).histories(run.q, run.v)
+    missing = np.linalg.norm((history.kept - run.momentum).reshape(-1, 2, 3), axis=2)
+    drift = np.divide(missing, history.scale, np.zeros_like(missing), where=history.scale > 0.0)
     return Motion(
         **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
         target=target,
-        prediction=predict(plan, x, run.steps),
+        prediction=x[:0] if foresees is None else predict(plan, foresees, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
-        momentum_drift=conserved.momentum_drift(history, run.momentum),
+        momentum_drift=drift.max(axis=1),
         # In orbit, the centre of mass does not move along a straight line even without forces.
         com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
@@ -256,7 +241,97 @@ def motion_of(plan: Plan, plant: Plant, conserved: Conserved, run: Recording) ->
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
-        notes=(*plan.notes(), *getattr(plan.law and plan.law.policy, "notes", ())),
+        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
+
+
+def predictor(plan: Plan) -> Predictor | None:
+    """Return the predictor of a plan's motion: of the policy's own model, or the given model."""
+    linear, policy, plant = plan.options.linear, plan.policy, plan.plant
+    given = not (linear is None or isinstance(linear, bool | np.bool_))
+    if not (given or linear is None or linear):
+        return None
+    lin = getattr(policy, "lin", None)
+    if given:
+        lin = _fitted(plan, linear)
+    if isinstance(lin, LinearModel) and lin.state_names == plant.state.names:
+        if policy is None:
+            nothing = np.zeros(len(lin.u0))
+            return lin, lambda _: nothing
+        if isinstance(policy, LinearController) and policy.dt:
+            terms = policy.terms
+            law = Compensation(len(terms.A), lambda _: terms)
+            return lin, lambda e: law.step(
+                0.0, lambda _, u: lin.y0 + lin.C @ e + lin.D @ (u - lin.u0)
+            )
+        if isinstance(policy, LinearController):
+            both, gains, offset = policy.around(lin)
+            return both, lambda e: offset + gains @ e
+        own, K = getattr(policy, "lin", None), getattr(policy, "K", None)
+        if K is not None and isinstance(own, LinearModel):
+            fed = [lin.state_names.index(name) for name in own.state_names]
+            apart = lin.x0[fed] - own.x0
+            return lin, lambda e: own.u0 - K @ (e[fed] + apart)
+    if linear is None:
+        return None
+    raise InputError(
+        "linear= is given, but this model cannot predict a motion with a policy of type "
+        f"{type(policy).__name__}; leave linear= out, or give the full model of a StateFeedback, "
+        "an OutputFeedback, a LinearController or no policy"
+    )
+
+
+def _fitted(plan: Plan, linear: object) -> LinearModel:
+    """Return the given model, or raise `InputError` if it does not fit the simulation."""
+    lin = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
+    state, policy = plan.plant.state, plan.policy
+    names = (state.names, plan.plant.actuation.names, state.frame)
+    same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
+    if isinstance(policy, LinearController):
+        same = same and lin.output_names == policy.lin.output_names
+    if not same or not lin.reference.isApprox(state.reference, 1e-9):
+        raise InputError(
+            f"linear is a model of '{lin.robot}' with other states, inputs, frame or "
+            f"reference than the simulation of '{state.robot.name}'; linearise the simulated "
+            "robot with the frame and the reference of the policy"
+        )
+    return lin
+
+
+# After an overflow the prediction is omitted, so NumPy need not warn.
+@np.errstate(over="ignore", invalid="ignore")
+def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
+    """Return the states (N, nx) that the linear closed loop predicts; no rows if it cannot."""
+    lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
+    if lin is None:  # a model in discrete time without its motion between samples
+        return x[:0]
+    x0, u0 = lin.x0, lin.u0
+    of = [lin.state_names.index(f"qdot_m.{name}") for name in plan.limits.wheel_names]
+    channel = plan.channel(foresees[1], speeds=lambda e: (x0 + e)[of])
+    rows: list[Array] = []
+    e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
+
+    def stepped(e: Array) -> Array:
+        """Return e after one step of the classical Runge-Kutta method."""
+        after, rate = e, np.zeros(len(e))
+        for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            at = e + share * dt * rate
+            rate = lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0
+            after = after + weight * dt / 6.0 * rate
+        return after
+
+    cuts = not sample and channel.cuts
+    held = lin.discretize(dt) if sample else lin
+    A, B, f0 = held.A, held.B, held.f0
+    if not (sample or cuts):  # a step is then e -> A e + f0
+        f0 = stepped(np.zeros(len(e)))
+        A = np.column_stack([stepped(unit) - f0 for unit in np.eye(len(e))])
+    for step in range(steps):
+        u = channel.begin(step, e) if sample else u0
+        if step % every == 0:
+            rows.append(e)
+        e = stepped(e) if cuts else A.dot(e) + B.dot(u - u0) + f0
+    found = (np.array([*rows, e]) + x0)[: len(x), : x.shape[1]]
+    return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]

@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.base.process import Progress, import_path_without
-from fflin.batch.workers import OwnWorkers
+from fflin.batch.run import OwnWorkers
 from tests.support.commands import run, run_in_process
 
 pytestmark = pytest.mark.process

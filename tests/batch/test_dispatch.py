@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.batch import chunks as batch_chunks
 from fflin.batch import run as dispatching
+from fflin.batch.run import Execution
+from fflin.batch.sweep import ChunkJob
 from fflin.kernel import compiled
 from tests.support.messages import any_wording
 from tests.support.patience import STALL, finished, finishing
@@ -57,10 +58,10 @@ def test_a_worker_unpickles_the_robot_once(robot, monkeypatch):
     assert np.array_equal(batch.q, q)
 
 
-def kill_at(start_to_kill, marker, original=batch_chunks.ChunkJob.run):
+def kill_at(start_to_kill, marker, original=ChunkJob.run):
     """A run that kills its worker at one chunk, as long as the marker's count lasts."""
 
-    def run(job, points, start, out=None):
+    def run(job, points, start, out):
         if start == start_to_kill and marker.exists():
             left = int(marker.read_text()) - 1
             if left:
@@ -73,7 +74,7 @@ def kill_at(start_to_kill, marker, original=batch_chunks.ChunkJob.run):
     return run
 
 
-class KillingJob(batch_chunks.ChunkJob):
+class KillingJob(ChunkJob):
     """A job whose worker is killed at the chunk that begins at 24."""
 
     marker = None
@@ -81,7 +82,7 @@ class KillingJob(batch_chunks.ChunkJob):
     def __reduce__(self):
         return _killing, (self.marker, self._again)
 
-    def run(self, points, start, out=None):
+    def run(self, points, start, out):
         if self.marker is not None:
             return kill_at(24, self.marker)(self, points, start, out)
         return super().run(points, start, out)
@@ -108,7 +109,7 @@ def killing(monkeypatch, tmp_path):
 
 BEGIN = """
 import os, sys, time
-from fflin.batch.run import executor_of
+from fflin.batch.run import Execution
 
 def busy(_):
     print("begun", flush=True)
@@ -116,7 +117,8 @@ def busy(_):
         pass
 
 if __name__ == "__main__":
-    with executor_of(None, 2) as workers:
+    with Execution(workers=2) as how:
+        workers = how.executor
         workers.submit(pow, 2, 3).result()
         {task}
         sys.stdin.read()
@@ -155,9 +157,9 @@ def test_there_are_no_more_workers_than_cores(robot):
     with (
         any_wording(),
         pytest.warns(fflin.FflinWarning, match=f"1000000 .* {cores} "),
-        dispatching.executor_of(None, 10**6) as workers,
+        Execution(workers=10**6) as how,
     ):
-        assert dispatching.worker_count(workers) == cores
+        assert how.count(None) == cores
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity")
@@ -271,7 +273,7 @@ def test_dask(robot):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        assert dispatching.worker_count(client.get_executor()) == 2
+        assert Execution(client.get_executor()).count(None) == 2
         configurations = fflin.random_configurations(robot, 400, seed=1)
         expected = fflin.sweep(robot, configurations)
         q, v, u = points(robot, 30)

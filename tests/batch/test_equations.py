@@ -7,8 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.chunks import BatchEquations
-from fflin.batch.rows import Points
+from fflin.batch.sweep import ChunkJob
 from fflin.kernel.compiled import kernel
 from fflin.linear import linearization
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
@@ -48,8 +47,8 @@ def agreement(robot, count=11, **options):
     if options.get("moving"):
         shapes["_drift"] = (nx,)
     out = {key: np.full((count, *shape), np.nan) for key, shape in shapes.items()}
-    equations = BatchEquations(linearizer.prepared, only_inertia=False)
-    assert not len(equations.write(Points(q, v, u), out))
+    job = ChunkJob(robot, at_rest=False, **options)
+    assert not len(job.write({"q": q, "v": v, "u0": u}, out))
     worst = 0.0
     for row in range(count):
         lin = linearizer(q[row], v[row], u[row])
@@ -172,8 +171,8 @@ def test_angles_beyond_the_kernels_sines_are_left(robots):
     nv, nx = 6 + robot.n, 12 + 2 * robot.n
     out = {"A": (nx, nx), "B_lower": (nv, u.shape[1]), "f0": (nx,), "_x0": (nx,)}
     arrays = {key: np.zeros((20, *shape)) for key, shape in out.items()}
-    equations = BatchEquations(fflin.Linearizer(robot).prepared, only_inertia=False)
-    assert equations.write(Points(q, v, u), arrays).tolist() == [3]
+    job = ChunkJob(robot, at_rest=False)
+    assert job.write({"q": q, "v": v, "u0": u}, arrays).tolist() == [3]
 
 
 def test_outputs_are_left_to_the_linearizer(robots):

@@ -5,8 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.chunks import BatchEquations
-from fflin.batch.rows import Points
+from fflin.batch.sweep import ChunkJob
 from fflin.dynamics.rnea import Inertia
 from fflin.linear.check import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
@@ -31,10 +30,8 @@ def agreement(robot, q):
     """Largest difference of kernel and loop, over what the conditioning of M lets round-off do."""
     size = 6 + robot.n
     kernel, loop = np.empty((2, len(q), size, size))
-    prepared = fflin.Linearizer(robot).prepared
-    equations = BatchEquations(prepared, only_inertia=True)
-    assert not len(equations.write(Points(q, None, None), {"B_lower": kernel}))
-    inertia = Inertia(prepared.map, robot.create_data())
+    assert not len(ChunkJob(robot, at_rest=True).write({"q": q}, {"B_lower": kernel}))
+    inertia = Inertia(fflin.StateMap(robot), robot.create_data())
     for point, inverse in zip(q, loop, strict=True):
         inertia.invert(point, inverse)
     worst = 0.0

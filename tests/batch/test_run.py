@@ -1,49 +1,45 @@
 """Any rows through any job: drawn by a seed, on threads or workers, into a file that goes on."""
 
 from contextlib import closing
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import fflin
 from fflin.batch.files import FileStore, MemoryStore, read_rows
-from fflin.batch.run import ChunkResult, executor_of, failure, run_chunks
+from fflin.batch.run import Execution, failure, run_chunks
 
 COUNT, CHUNK = 50, 8
+ALONE = Execution(threads=1)
 STORED = {"seed": (), "walk": (3,)}
-
-
-class Seeds(NamedTuple):
-    seed: np.ndarray
 
 
 class Walks:
     """Random walks; that of one seed has no end."""
 
     shapes = {"walk": (3,)}  # noqa: RUF012
+    threaded = True
 
     def __init__(self, endless=-1):
         self.endless = endless
 
-    def run(self, rows, start, out=None):
-        out = {"walk": np.empty((len(rows.seed), 3))} if out is None else out
-        for at, seed in enumerate(rows.seed.astype(int)):
+    def run(self, rows, start, out):
+        for at, seed in enumerate(rows["seed"].astype(int)):
             if seed == self.endless:
                 raise fflin.FflinError(f"walk {start + at} has no end")
             out["walk"][at] = np.random.default_rng(seed).normal(size=(9, 3)).sum(axis=0)
-        return ChunkResult(dict(out), ["tired"] * (start == 0))
+        return ["tired"] * (start == 0)
 
 
 def seeds(start, stop):
-    return Seeds(np.arange(start, stop, dtype=float))
+    return {"seed": np.arange(start, stop, dtype=float)}
 
 
 @pytest.fixture(scope="module")
 def expected():
     store = MemoryStore(COUNT, COUNT, STORED)
     with pytest.warns(fflin.FflinWarning, match="tired"):
-        assert not run_chunks(Walks(), seeds, store)
+        assert not run_chunks(Walks(), seeds, store, ALONE)
     return store.arrays
 
 
@@ -60,16 +56,9 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
         pace = {"pace": np.array([1.5])}
         with (
             closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,
-            executor_of(None, workers) as executor,
+            Execution(workers=workers or None, threads=threads) as how,
         ):
-            failed = run_chunks(
-                job,
-                seeds,
-                store,
-                executor=executor,
-                threads=threads,
-                progress=lambda done, _: told.append(done),
-            )
+            failed = run_chunks(job, seeds, store, how, lambda done, _: told.append(done))
             if failed:
                 raise failure(failed, store, "walks", list)
             store.complete()
@@ -89,15 +78,15 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
 @pytest.mark.filterwarnings("ignore:tired")
 def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
     told, store = [], MemoryStore(COUNT, CHUNK, STORED)
-    how = {"all_needed": True, "progress": lambda done, _: told.append(done)}
-    failed = run_chunks(Walks(endless=20), seeds, store, **how)
-    assert [done.span for done in failed] == [(16, 24)] and told == [8, 16]
+    tell = lambda done, _: told.append(done)  # noqa: E731
+    failed = run_chunks(Walks(endless=20), seeds, store, ALONE, tell, all_needed=True)
+    assert [each[:2] for each in failed] == [(16, 24)] and told == [8, 16]
 
 
 def test_in_memory_the_error_has_what_is_made_of_the_rest():
     store = MemoryStore(COUNT, CHUNK, STORED)
     with pytest.warns(fflin.FflinWarning, match="tired"):
-        failed = run_chunks(Walks(endless=20), seeds, store)
+        failed = run_chunks(Walks(endless=20), seeds, store, ALONE)
     error = failure(failed, store, "walks", lambda kept: store.arrays["seed"][kept])
     assert error.failed == ((16, 24, "walk 20 has no end"),)
     assert np.array_equal(error.batch, np.r_[0:16, 24:50])

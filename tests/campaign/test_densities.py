@@ -13,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 
 def drawn(robot, given):
     job = CampaignJob(robot, None, given, 0, "python", {"duration": 1.0})
-    return job.dispersions.one(job.dispersions.rows(0, 1).drawn[0])[0].robot
+    return job.dispersions.one(job.dispersions.drawn(0, 1)[0])[0].robot
 
 
 def same_bodies(robot, other):
@@ -72,7 +72,7 @@ def test_one_draw_for_all_that_a_pattern_names():
     names = job.dispersions.names
     assert {"panel_*.stiffness", "joint_*.mass", "panel_*.com.x", "q_b"} < set(names)
     assert len(names) == 1 + 1 + 3 + 3 + 1 + 1
-    rows = job.dispersions.rows(0, 4).drawn
+    rows = job.dispersions.drawn(0, 4)
     assert len(np.unique(rows[:, names.index("joint_*.mass")])) == 4
     for row in rows:
         value = dict(zip(names, row, strict=True))
@@ -92,7 +92,7 @@ def test_one_draw_for_all_that_a_pattern_names():
     # The draws of what is not tied stay those that they are alone.
     alone = CampaignJob(robot, None, {"joint_2.com": 0.01}, 0, "python", {"duration": 1.0})
     same = [names.index(name) for name in alone.dispersions.names]
-    assert (alone.dispersions.rows(0, 4).drawn == rows[:, same]).all()
+    assert (alone.dispersions.drawn(0, 4) == rows[:, same]).all()
 
 
 def test_a_tied_density_is_of_all_its_links():

@@ -139,13 +139,13 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
     before = [each.columns[0].inverse.__self__.count for each in (once, plain)]
     for each in (once, plain):
         each.require_possible(2100)
-    assert once.rows(3, 20).drawn.shape == (17, 1)
-    parts = [once.rows(*span).drawn for span in ((0, 1000), (1000, 1030), (1030, 2100))]
+    assert once.drawn(3, 20).shape == (17, 1)
+    parts = [once.drawn(*span) for span in ((0, 1000), (1000, 1030), (1030, 2100))]
     counts = [each.columns[0].inverse.__self__.count for each in (once, plain)]
     assert counts == [each + 2100 for each in before]
-    u = plain.rows(0, 2100).drawn
+    u = plain.drawn(0, 2100)
     np.testing.assert_allclose(np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14)
-    np.testing.assert_allclose(uniform.rows(5, 2100).drawn, -0.1 + 0.2 * u[5:], rtol=1e-14)
+    np.testing.assert_allclose(uniform.drawn(5, 2100), -0.1 + 0.2 * u[5:], rtol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import pytest
 
 import fflin
 from fflin.base.process import Progress
+from fflin.batch import run as batch_run
+from fflin.batch.run import Execution
 from fflin.campaign import runs as runs_module
 from fflin.campaign.runs import CampaignJob
 from fflin.commands import cli
@@ -26,12 +28,12 @@ def clock(monkeypatch):
     """Let a run take a millisecond for each step and 20 ms at its start."""
     now, done, flown = [0.0], CampaignJob.run, runs_module._recorded
 
-    def timed(job, rows, start, out=None):
-        now[0] += len(rows.drawn) * 20.0 * STEP
+    def timed(job, rows, start, out):
+        now[0] += len(rows["drawn"]) * 20.0 * STEP
         return done(job, rows, start, out)
 
-    def stepped(plan, plant, every):
-        found = flown(plan, plant, every)
+    def stepped(plan, every):
+        found = flown(plan, every)
         now[0] += found.steps * STEP  # a run may end early
         return found
 
@@ -53,10 +55,10 @@ def test_a_campaign_and_validity_say_what_they_will_take(clock):
     bar, options = Told(), {"duration": 10.0, "dt": 0.1, "engine": "python"}
     campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, progress=bar, **options)
     assert bar.told == (pytest.approx(3 * 120 * STEP), 1)
-    work = [(campaign._job, campaign._job.dispersions.rows(0, 1), 3)]
-    runs_module.expect(bar, work, ThreadPoolExecutor(2), None)
+    work = [(campaign._job, campaign._job.dispersions.drawn(0, 1), 3)]
+    runs_module.expect(bar, work, Execution(ThreadPoolExecutor(2)))
     assert bar.told == (pytest.approx(1.5 * 120 * STEP), 2)
-    runs_module.expect(bar, work, ThreadPoolExecutor(20), None)
+    runs_module.expect(bar, work, Execution(ThreadPoolExecutor(20)))
     assert bar.told == (pytest.approx(120 * STEP), 3)
     silent = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, **options)
     assert (silent.q == campaign.q).all()  # the estimate changes no run
@@ -88,7 +90,7 @@ def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, said):
 def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch, capsys):
     (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.1\n")
     monkeypatch.setattr(CampaignJob, "seconds", lambda *_: np.float64(1000.0))
-    monkeypatch.setattr(runs_module, "available_cores", lambda: 1)
+    monkeypatch.setattr(batch_run, "available_cores", lambda: 1)
     monkeypatch.chdir(tmp_path)
     assert cli.main(command.split()) == 0
     err = capsys.readouterr().err

@@ -178,7 +178,7 @@ def test_a_run_is_flown_again_to_the_last_bit_and_keeps_its_momentum(robots, eng
 def test_a_body_that_is_drawn_is_a_body(robots):
     given = {"*.mass": (-0.9, 2.0), "*.com": 0.5, "*.inertia": (-0.9, 3.0)}
     job = CampaignJob(robots["canadarm2"], None, given, 0, "python", {"duration": 1.0})
-    bodies = job.dispersions.bodies(job.dispersions.rows(0, 200).drawn)
+    bodies = job.dispersions.bodies(job.dispersions.drawn(0, 200))
     assert len(bodies) == 8
     for mass, _, inertia in bodies.values():
         second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
@@ -281,7 +281,7 @@ def test_each_kind_of_spread_has_its_distribution(robots):
         "r_b.y": stats.gamma(3.0, scale=0.1),
     }
     job = CampaignJob(robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0})
-    of = dict(zip(job.dispersions.names, job.dispersions.rows(0, 4000).drawn.T, strict=True))
+    of = dict(zip(job.dispersions.names, job.dispersions.drawn(0, 4000).T, strict=True))
     for name, expected in (
         ("q_b.x", stats.norm(0.0, 0.05)),
         ("q_b.y", stats.uniform(-0.1, 0.3)),

@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import (
     KINDS,
@@ -23,6 +22,7 @@ from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE
 from fflin.simulation.run import Recording
+from tests.support.campaigns import flown
 from tests.support.robots import LINKS, MIMIC, free_body
 
 STEPS = 90
@@ -195,7 +195,7 @@ def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engi
     starts[9, 5] = 1e-3
     judge = Judge(("end", "stop"), lambda runs: {key: runs[key] for key in judge.fields}, halved)
     job = CampaignJob(robot, policy, None, 0, engine, options, judge)
-    found = job.run(Draws(starts), 0).arrays
+    found = flown(job, starts)
     ends = []
     for start in starts:
         x = job.replay(start).x[::LOOK]

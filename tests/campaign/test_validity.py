@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -20,12 +21,11 @@ from scipy.stats import binomtest
 
 import fflin
 from fflin.base.intervals import clopper_pearson
-from fflin.batch.run import executor_of
-from fflin.campaign.dispersions import Draws
+from fflin.batch.run import Execution, OwnWorkers
 from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
-from fflin.simulation.plant import Conserved
 from fflin.simulation.run import go
+from tests.support.campaigns import flown
 from tests.support.commands import refused, run
 from tests.support.messages import any_wording, says
 from tests.support.patience import finished, finishing
@@ -78,9 +78,9 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
     job = settling_runs(loop, False, None, 1.0)
-    plan, plant = job.plan_of(x - lin.x0)
+    plan = job.plan_of(x - lin.x0)
     times = plan.times._replace(dt=0.02, steps=200, every=1)
-    run = go(replace(plan, times=times), plant, Conserved(robot, plan.q))
+    run = go(plan.replace(times=times))
     end = loop.state.to_state(run.q[-1], run.v[-1], near=x)
     data = robot.create_data()
     q, v = loop.state.to_pinocchio(x)
@@ -111,10 +111,7 @@ def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, ou
     loop = Loop(robots["cubesat"], lin, gain.K)
     x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
     found = settle(
-        lambda fine: settling_runs(loop, False, None, 0.0, fine),
-        lambda runs: np.tile(x - lin.x0, (len(runs), 1)),
-        1,
-        "python",
+        partial(settling_runs, loop, False, None, 0.0, "python"), (x - lin.x0)[None], Execution()
     )
     assert OUTCOMES[int(found["outcome"][0])] == outcome
 
@@ -210,8 +207,8 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
         e = step @ e
     settles = next(k for k, size in enumerate(sizes) if size <= 1e-3 * sizes[0])
     for steps, outcome in ((settles, 1.0), (settles - 1, 0.0)):
-        job.plan = replace(job.plan, times=times._replace(steps=steps))
-        assert job.run(Draws((x - lin.x0)[None]), 0).arrays["outcome"] == [outcome]
+        job.plan = job.plan.replace(times=times._replace(steps=steps))
+        assert flown(job, (x - lin.x0)[None])["outcome"] == [outcome]
 
 
 @pytest.mark.compiled
@@ -361,7 +358,7 @@ def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     lin, gain = held(robot)
     # A function of Python's own, for which a worker imports nothing.
     monkeypatch.setattr(Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,)))
-    for pool in (executor_of(None, 1), ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
+    for pool in (OwnWorkers(1), ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
         with pool as executor, pytest.raises(fflin.FflinError, match=r"died|terminated abruptly"):
             fflin.validity(robot, lin, gain, samples=2, executor=executor)
 

@@ -10,9 +10,10 @@ import pytest
 
 import fflin
 from fflin.kernel.compiled import ENGINES
-from fflin.simulation import lanes, packing, run
-from fflin.simulation.plan import SimulationOptions, planned
-from fflin.simulation.plant import Conserved, Plant
+from fflin.kernel.tree import batch_tree
+from fflin.simulation import lanes, run
+from fflin.simulation.plan import Plan, SimulationOptions
+from fflin.simulation.plant import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
@@ -254,8 +255,9 @@ def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, m
     policy = feedback(robot)
     options = {"x0": displaced(policy.lin), "duration": 1.0, "dt": 0.01, "linear": False}
     motion = fflin.simulate(robot, policy, **options, engine="compiled")
-    advance = lanes.LaneLoop.advance
-    monkeypatch.setattr(lanes.LaneLoop, "advance", lambda *a: [calls.append(a), advance(*a)])
+    kernel = lanes.kernel
+    counted = lambda *names: lambda *a: [calls.append(a), kernel(*names)(*a)]  # noqa: E731
+    monkeypatch.setattr(lanes, "kernel", counted)
     monkeypatch.setattr(lanes, "_MEMORY", memory)
     found = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
     chosen = np.append(np.arange(0, 100, every), 100)
@@ -312,7 +314,7 @@ def test_eight_lanes_are_eight_runs(robots):
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     starts, masses, gains = np.random.default_rng(6).uniform(0.8, 1.2, (3, 8))
-    plans = []
+    plans, runs = [], []
     for share, mass, gain in zip(starts, masses, gains, strict=True):
         model = robot.model.copy()
         for joint in range(1, model.njoints):
@@ -321,35 +323,38 @@ def test_eight_lanes_are_eight_runs(robots):
             )
         own = fflin.from_model(model, inputs=robot.inputs)
         options = {"x0": share * displaced(lin), "duration": 2.0, "dt": 0.01, "linear": False}
-        plan, plant = planned(own, policy, SimulationOptions(**options))
-        count = len(plant.faults.gain)
-        faults = plant.faults._replace(gain=np.full(count, gain))
-        plans.append((plan, Plant(plant.state, faults=faults)))
-    parts = [packing.packed(plan, plant) for plan, plant in plans]
-    together = lanes.LaneLoop(*plans[0])
-    for lane, own in enumerate(parts):
-        for array, values in zip(in_lanes(together.parts), in_lanes(own), strict=True):
-            array[:, lane] = values
-    clock, rows = np.zeros(1, dtype=np.intp), together.rows(20)
-    together.advance(clock, 150, 10, rows)
-    together.advance(clock, 200, 10, rows[15 * together.width :])
-    q, _, u, _, _ = together.split(rows)
-    for lane, (plan, plant) in enumerate(plans):
-        motion = run.go(plan, plant, Conserved(plant.robot, plan.q))
-        np.testing.assert_allclose(q[:, lane], motion.q[:200:10], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(u[:, lane], motion.u[:200:10], rtol=1e-11, atol=1e-11)
-        at = together.parts.point.q[:, lane]
-        np.testing.assert_allclose(at, motion.q[-1], rtol=0, atol=1e-12)
-    assert np.ptp(together.parts.point.q[:7], axis=1).min() > 1e-4
+        plan = Plan(SimulationOptions(robot=own, policy=policy, **options))
+        plant = plan.plant
+        faults = plant.faults._replace(gain=np.full(len(plant.faults.gain), gain))
+        plans.append(plan.replace(plant=Plant(plant.state, faults=faults)))
+        start = {"q": plan.q, "nu": plant.state.velocities(plan.v)}
+        runs.append(start | {"bodies": batch_tree(own).bodies} | faults._asdict())
+    together, kept = lanes.LaneLoop(plans[0]), Kept()
+    out = {"end": np.empty(8)}
+    together.fly(kept, out, {key: np.array([each[key] for each in runs]) for key in runs[0]})
+    assert (out["end"] == 200.0).all()
+    q, u = (np.concatenate([rows[k] for rows in kept.slices]) for k in (0, 2))
+    for lane, plan in enumerate(plans):
+        motion = run.go(plan)
+        np.testing.assert_allclose(q[:20, lane], motion.q[:200:10], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(u[:20, lane], motion.u[:200:10], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(q[-1, lane], motion.q[-1], rtol=0, atol=1e-12)
+    assert np.ptp(q[-1, :, :7], axis=0).min() > 1e-4
 
 
-def in_lanes(parts):
-    """What differs between eight runs: start, inertias, inputs, and what is kept."""
-    robot, reference, point = parts.robot, parts.reference, parts.point
-    return (
-        *(robot.tree.bodies, *robot.faults),
-        *(reference.start, reference.weight, reference.per_mass, point.q, point.nu),
-    )
+class Kept(lanes.Statistics):
+    """Every tenth row of eight runs, in slices of 150 steps, and the last."""
+
+    every, span = 10, 150
+
+    def __init__(self):
+        self.slices = []
+
+    def add(self, first, rows, raw):
+        self.slices.append([each.copy() for each in rows])
+
+    def outcome(self, done, stop):
+        return {"end": np.full(8, float(done))}
 
 
 def test_arguments_are_laid_out_or_refused():

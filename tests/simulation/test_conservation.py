@@ -8,8 +8,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.simulation.plant import Conserved
 from fflin.simulation.report import motion_report
+from fflin.simulation.run import Conserved
 from tests.simulation.test_simulate import displaced, free_body, regulated, tumbling
 from tests.support.robots import random_tree
 

@@ -5,7 +5,7 @@ import pytest
 
 import fflin
 from fflin.control.authority import thrusters_give_every_wrench
-from fflin.simulation.times import time_to_settle
+from fflin.simulation.plan import time_to_settle
 
 
 def course(robot, policy, q):

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from fflin.campaign.runs import CampaignJob
+from fflin.batch.run import Execution
+from fflin.campaign.runs import CampaignJob, completed
+
+
+def flown(job, drawn):
+    """The arrays of runs with the drawn values, one chunk after the other."""
+    return completed(job, np.asarray(drawn), Execution(threads=1))
 
 
 def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
@@ -11,8 +17,8 @@ def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
     pytest.importorskip("numba")
     options = {"duration": 3.0, "dt": 0.01} | options
     jobs = [CampaignJob(robot, policy, given, 5, name, options) for name in ("python", "compiled")]
-    rows = jobs[0].dispersions.rows(0, runs)
-    python, lanes = (job.run(rows, 0).arrays for job in jobs)
+    drawn = jobs[0].dispersions.drawn(0, runs)
+    python, lanes = (flown(job, drawn) for job in jobs)
     for name in jobs[0].shapes:
         size = np.maximum(1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0))
         assert np.array_equal(np.isinf(python[name]), np.isinf(lanes[name])), name
