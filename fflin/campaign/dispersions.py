@@ -30,7 +30,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
+from fflin.robot.mass_properties import bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
@@ -281,20 +281,14 @@ class Dispersions:
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of the dispersed bodies."""
         robot, model = self._plant.robot, self._model
-        pieces, changed = [*robot.pieces.values()], dict[int, list[tuple[Piece, Any]]]()
+        pieces, changed = [*robot.pieces.values()], dict[int, list[Array]]()
         mass, com, inertia, density = (self._of(kind, drawn) for kind in _OF_BODIES)
         dispersed = {at for each in self.columns if each.kind in _OF_BODIES for at in each.at}
         for at in sorted(dispersed):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
-            properties = varied(
-                pieces[at],
-                mass=mass[:, at],
-                density=density[:, at],
-                com=com[:, at],
-                inertia=inertia[:, at],
-            )
-            changed.setdefault(own, []).append((pieces[at], properties))
+            changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
+            changed.setdefault(own, []).append(varied(pieces[at], *changes))
         return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
