@@ -23,10 +23,10 @@ from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
+from fflin.linear.check import aba_route
 from fflin.linear.linearization import Prepared, own_reference, prepare
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, output_equations
-from fflin.linear.verification import aba_route
 from fflin.robot.joints import ROOT
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
@@ -169,7 +169,7 @@ def difference(derivatives: ModelDerivatives, one: Parameter) -> float:
         for joint, body in with_bodies(robot, one, times * step).items():
             model.inertias[joint] = body
         state = StateMap(replace(robot, model=model), reference=lin.reference, frame=lin.frame)
-        route = aba_route(state, Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
+        route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
         return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
 
     (dA, dB, *_), worst = derivatives.over([one]), 0.0
