@@ -34,7 +34,7 @@ from fflin.robot.mass_properties import bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
-from fflin.simulation.plant import Plant
+from fflin.simulation.run import Plant
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
 # Axes of the kinds of dispersions that have a value for each axis.

@@ -37,7 +37,7 @@ from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
-from fflin.simulation.run import Recording, go
+from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of
 
 _LARGEST_CHUNK = 256
@@ -134,7 +134,7 @@ class CampaignJob:
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
-        plan, loop = self.plan, packed(self.plan)
+        plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
         found: dict[str, object] = {**self._in_lanes(first), "target": self.target}
         if noise_of(plan):
             last = min(plan.times.steps, SLOTS * plan.times.sample)
