@@ -14,13 +14,11 @@ from fflin.base.validation import Array, instance, number, numbers, untied, vect
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
-from fflin.linear.model import LinearModel
 from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
-from fflin.uncertainty.fraction import Block, Range, fraction
-from fflin.uncertainty.lft import LFT
-from fflin.uncertainty.parameters import Parameter, Variants
+from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
+from fflin.uncertainty.parameters import Parameter, Parameters
 from fflin.uncertainty.worst import Worst, searched
 
 # Ranges are refused if there are more rejected draws per valid draw than this.
@@ -51,7 +49,7 @@ class Uncertain:
 
     robot: Robot
     blocks: tuple[Block, ...]
-    _variants: Variants
+    _parameters: Parameters
 
     def __repr__(self) -> str:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
@@ -81,8 +79,12 @@ class Uncertain:
             fixed point for all values of the parameters. The operating point can depend on the
             parameters because of gravity, an orbit, stored momentum or a deflected spring.
         """
-        robot = self.robot
-        lin = linearize(robot, q)
+        robot, lin = self.robot, linearize(self.robot, q)
+        if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in robot.outputs):
+            raise InputError(
+                "an output depends on accelerations or masses, which the LFT cannot represent; "
+                "remove it with robot.replace(outputs=)"
+            )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
@@ -92,7 +94,8 @@ class Uncertain:
                 "makes the point an equilibrium only for some values of the parameters; remove "
                 "this effect from the robot, or linearise each robot of samples(n)"
             )
-        return _lft(self, lin)
+        ready = prepare(robot, frame=lin.frame, reference=None, moving=False)
+        return linear_fractional(lin, ready, self._parameters.pieces, self.blocks)
 
     def at(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with the given parameter values {parameter or pattern: value}.
@@ -106,11 +109,11 @@ class Uncertain:
         InputError
             If the inertia of a body with these parameters is not physically realisable.
         """
-        return self._variants.robot(self._each(numbers("values", values, "parameter", "value")))
+        return self._parameters.robot(self._each(numbers("values", values, "parameter", "value")))
 
     def _each(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return {parameter: value} with names and patterns expanded."""
-        known, found = self._variants.parameters, dict[str, float]()
+        known, found = self._parameters, dict[str, float]()
         blocks = {each.name: each for each in self.blocks if each.name not in known}
         for key, value in values.items():
             if key in blocks:
@@ -126,7 +129,7 @@ class Uncertain:
     def _refusal(self, delta: Array) -> str:
         pairs = zip(self.blocks, delta, strict=True)
         of_blocks = [block.values(block.middle + block.half * d) for block, d in pairs]
-        return self._variants.refusal({name: x for of in of_blocks for name, x in of.items()})
+        return self._parameters.refusal({name: x for of in of_blocks for name, x in of.items()})
 
     def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
         """Return deltas (n, k) drawn uniformly from [-1, 1], and the number of rejected draws.
@@ -271,18 +274,18 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
             given[key] = value
     if not given:
         raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
-    variants, alone, together = Variants(robot), dict[str, Block](), list[Block]()
+    parameters, alone, together = Parameters(robot), dict[str, Block](), list[Block]()
     for key, value in given.items():
         own, tied = untied(key, value)
-        ones = [variants.parameters[name] for name in variants.parameters.find(key)]
+        ones = [parameters[name] for name in parameters.find(key)]
         if tied:
             together.append(_tied(key, ones, own))
         else:
             for one in ones:
                 _, middle, half = each = _range(one, own)
                 alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
-    made = Uncertain(robot, (*alone.values(), *together), variants)
-    _refuse_overlap(variants.pieces, made.ranges)
+    made = Uncertain(robot, (*alone.values(), *together), parameters)
+    _refuse_overlap(parameters.pieces, made.ranges)
     if why := made._refusal(np.zeros(len(made.blocks))):
         raise InputError(
             f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
@@ -352,34 +355,3 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
     # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
-
-
-def _lft(of: Uncertain, lin: LinearModel) -> LFT:
-    ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
-    if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
-        feels = "an output depends on accelerations or masses, which the LFT cannot represent"
-        raise InputError(f"{feels}; remove it with robot.replace(outputs=)")
-    form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
-    nv, nw = len(lin.A) // 2, len(form.z[0])
-    x, w, u = form.a
-    A = np.vstack((lin.A[:nv], x))
-    return LFT(
-        A=A,
-        B1=np.vstack((np.zeros((nv, nw)), w)),
-        B2=np.vstack((np.zeros((nv, u.shape[1])), u)),
-        C1=form.z[0],
-        D11=form.z[1],
-        D12=form.z[2],
-        C2=np.array(lin.C),
-        D21=np.zeros((len(lin.C), nw)),
-        D22=np.array(lin.D),
-        parameters=of.names,
-        units=tuple(each.unit for each in of.blocks),
-        repeats=np.array([float(each.repeats) for each in of.blocks]),
-        middle=np.array([each.middle for each in of.blocks]),
-        half=np.array([each.half for each in of.blocks]),
-        state_names=lin.state_names,
-        input_names=lin.input_names,
-        output_names=lin.output_names,
-        robot=lin.robot,
-    )
