@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from fflin.base.validation import Array, instance, number, numbers, untied, vect
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import linearize, prepare
-from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
 from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
@@ -109,27 +107,24 @@ class Uncertain:
         InputError
             If the inertia of a body with these parameters is not physically realisable.
         """
-        return self._parameters.robot(self._each(numbers("values", values, "parameter", "value")))
-
-    def _each(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return {parameter: value} with names and patterns expanded."""
         known, found = self._parameters, dict[str, float]()
         blocks = {each.name: each for each in self.blocks if each.name not in known}
-        for key, value in values.items():
+        for key, value in numbers("values", values, "parameter", "value").items():
             if key in blocks:
                 found |= blocks[key].values(value)
             else:
                 found |= dict.fromkeys(known.find(key), value)
-        return found
+        return known.robot(found)
 
     def makes(self, delta: Array) -> bool:
         """Return whether the robot with the deltas (k,) is physically realisable."""
         return not self._refusal(delta)
 
     def _refusal(self, delta: Array) -> str:
-        pairs = zip(self.blocks, delta, strict=True)
-        of_blocks = [block.values(block.middle + block.half * d) for block, d in pairs]
-        return self._parameters.refusal({name: x for of in of_blocks for name, x in of.items()})
+        values = dict[str, float]()
+        for block, d in zip(self.blocks, delta, strict=True):
+            values |= block.values(block.middle + block.half * d)
+        return self._parameters.refusal(values)
 
     def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
         """Return deltas (n, k) drawn uniformly from [-1, 1], and the number of rejected draws.
@@ -285,7 +280,18 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
                 _, middle, half = each = _range(one, own)
                 alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
     made = Uncertain(robot, (*alone.values(), *together), parameters)
-    _refuse_overlap(parameters.pieces, made.ranges)
+    names = [each.parameter.name for each in made.ranges]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(
+            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
+            "only one of these ranges"
+        )
+    pieces = parameters.pieces
+    for name, other in permutations({each.parameter.of for each in made.ranges} & pieces.keys(), 2):
+        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
+            raise InputError(
+                f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
+            )
     if why := made._refusal(np.zeros(len(made.blocks))):
         raise InputError(
             f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
@@ -293,28 +299,12 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     return made
 
 
-def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> None:
-    names = [each.parameter.name for each in ranges]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(
-            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
-            "only one of these ranges"
-        )
-    asked = {each.parameter.of for each in ranges} & pieces.keys()
-    for name, other in permutations(asked, 2):
-        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
-            raise InputError(
-                f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
-            )
-
-
 def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
-        said = (
-            "rotates a unit vector, so that the model is not a rational function of it; use "
-            "fflin.sensitivity for this parameter"
+        raise InputError(
+            f"'{one.name}' rotates a unit vector, so that the model is not a rational function of "
+            "it; use fflin.sensitivity for this parameter"
         )
-        raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
@@ -339,7 +329,7 @@ def _range(one: Parameter, value: object) -> Range:
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
 
-def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
+def _tied(key: str, parameters: list[Parameter], value: object) -> Block:
     """Return the block of tied parameters, which have a common delta."""
     ranges = [_range(one, value) for one in parameters]
     units = {one.unit for one in parameters}
@@ -351,7 +341,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
                 "range, such as 0.2 for 20 %"
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
-    relative = abs(float(value))
+    relative = abs(number(key, value))
     # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
