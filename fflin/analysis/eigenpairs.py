@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.analysis.mechanics import warn_of_stiffness
 from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
@@ -36,7 +35,6 @@ class NaturalModes(NamedTuple):
 
 def natural_modes(lin: LinearModel) -> NaturalModes:
     """Return the natural modes of a continuous model whose states are positions and their rates."""
-    warn_of_stiffness(lin)
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
     # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
     # this size are set to zero.

@@ -11,10 +11,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.eigenpairs import natural_modes
+from fflin.analysis.mechanics import checked
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, folded, grid, width
-from fflin.base.validation import Array, Complex, FrozenArrays, instance
+from fflin.base.validation import Array, Complex, FrozenArrays
 from fflin.dynamics.coordinates import Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -300,13 +301,10 @@ def modes(lin: LinearModel) -> Modes:
     >>> found.rigid_body, found.frequencies.round(1)
     (13, array([0.9, 1.2]))
     """
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    lin.require_unchanged()
+    lin = checked(lin)
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
-    nx, nv = len(lin.A), len(lin.M)
-    if nx != 2 * nv:
-        raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
+    nv = len(lin.M)
     found = natural_modes(lin)
     pairs = sorted(found.pairs, key=lambda pair: (abs(pair.pole), pair.pole.real))
     shapes = []

@@ -508,7 +508,7 @@ def test_models_from_files_say_that_bodies_are_not_known(tmp_path):
 
 
 def test_terms_of_a_combination_that_are_left_out_are_counted():
-    from fflin.analysis.names import combination
+    from fflin.analysis.mechanics import combination
 
     weights = np.array([1.0, -0.5, 0.25, 0.2, 0.0, 1e-9, 0.1])
     shown = combination(weights, tuple("abcdefg"), np.ones(7))
