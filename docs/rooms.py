@@ -39,12 +39,22 @@ def purpose(room: str) -> str:
 
 
 def imports(room: str) -> Counter[str]:
-    """Return the number of import statements of a room for each imported room."""
+    """Return the number of imports of a room for each imported room.
+
+    A public name ``fflin.NAME`` is an import of its module.
+    """
+    stub = (ROOT / "fflin" / "__init__.pyi").read_text(encoding="utf-8")
+    public = {name: module for module, name in re.findall(r"^from (\S+) import (\w+)", stub, re.M)}
     found: Counter[str] = Counter()
     for file in (ROOT / "fflin" / room).rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fflin."):
-                found[str(node.module).split(".")[1]] += 1
+            module = ""
+            if isinstance(node, ast.ImportFrom):
+                module = node.module or ""
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "fflin":
+                module = public.get(node.attr, "")
+            if module.startswith("fflin."):
+                found[module.split(".")[1]] += 1
     del found[room]
     return found
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import pinocchio as pin
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
@@ -37,7 +37,7 @@ NORM_TOLERANCE = 1e-6
 DOUBLE = np.dtype(np.float64)
 
 
-def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
+def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
@@ -52,7 +52,7 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     return array
 
 
-def shaped(name: str, value: ArrayLike, shape: tuple[int, ...], hint: str = "") -> Array:
+def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> Array:
     """Return a new array of finite native floats of a shape, or raise `InputError`."""
     array = as_double(name, value)
     if array.shape != shape:
@@ -170,7 +170,7 @@ def is_rotation(R: Array) -> bool:
     return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
 
-def as_double(name: str, value: ArrayLike) -> Array:
+def as_double(name: str, value: object) -> Array:
     """Return a new array of native floats, or raise `InputError` if an entry is not a number."""
     refuse_masked(name, value)
     array = _as_array(name, value)

@@ -18,19 +18,21 @@ from fflin.commands.results import finish, require_own_kind
 
 # {task: {command: module}}, in the order of the help.
 TASKS = {
-    "inspect robots": {"robots": "models", "info": "models", "init": "models", "view": "visual"},
+    "inspect robots": {
+        **{"robots": "models", "info": "models", "init": "models"},
+        **{"view": "simulation"},
+    },
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "analyse a model": {
         **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity"), "analysis"),
-        **{"uncertain": "analysis", "validity": "regions", "funnel": "regions"},
+        **{"uncertain": "analysis", "validity": "campaigns", "funnel": "campaigns"},
     },
     "design and simulate": {
         **{"lqr": "regulator", "tvlqr": "regulator", "plan": "simulation"},
         **{"simulate": "simulation", "export": "regulator"},
     },
-    "many models or simulations": {"sweep": "sweeps", "montecarlo": "simulation"},
+    "many models or simulations": {"sweep": "campaigns", "montecarlo": "campaigns"},
 }
-_MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,8 +59,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             near = get_close_matches(unknown[0], chosen._option_string_actions, n=1, cutoff=0.75)
             hint = f"; did you mean {near[0]}?" if near else ""
             chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-        with files_of_command(*parser.files_of(arguments)):
-            check_outputs(arguments)
+        inputs, outputs = parser.files_of(arguments)
+        with files_of_command(inputs, [path for path, _ in outputs]):
+            # An output file that cannot be written is an error before any computation.
+            for path, kind in outputs:
+                check_output_path(path)  # first, because it reports an output that is also an input
+                check_ending(path, kind.endings)
+            if getattr(arguments, "plot", None):
+                from fflin.base.figures import require_matplotlib
+
+                require_matplotlib()
+            require_own_kind(arguments)
             code = finish(arguments.run(arguments), arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -89,24 +100,14 @@ def _parser(asked: str) -> parser.Command:
     commands = main.add_subparsers(
         prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
-    for name in [_MODULES[asked]] if asked in _MODULES else dict.fromkeys(_MODULES.values()):
-        import_module(f"fflin.commands.{name}").add_commands(commands)
-    # argparse puts all commands in one group; sort them into a group for each task.
-    left = {command.dest: command for command in commands._choices_actions}
-    commands._choices_actions = []
+    known = any(asked in names for names in TASKS.values())
     for task, names in TASKS.items():
-        group = main.add_argument_group(task)._group_actions
-        group += [left[name] for name in names if name in left]
+        group = main.add_argument_group(task)
+        for name, module in names.items():
+            if asked == name or not known:
+                made = import_module(f"fflin.commands.{module}")
+                parser.add_command(commands, getattr(made, name))
+        # argparse puts all commands in one group; move them to the group of their task.
+        group._group_actions += commands._choices_actions
+        commands._choices_actions = []
     return main
-
-
-def check_outputs(arguments: argparse.Namespace) -> None:
-    """Raise an error before any computation if an output file cannot be written."""
-    for path, kind in parser.outputs_of(arguments):
-        check_output_path(path)  # first, because it reports an output that is also an input
-        check_ending(path, kind.endings)
-        if kind is parser.FIGURE:
-            from fflin.base.figures import require_matplotlib
-
-            require_matplotlib()
-    require_own_kind(arguments)

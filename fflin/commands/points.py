@@ -1,82 +1,79 @@
-"""Robot and operating point that the arguments of a command define."""
+"""Robot, operating point and linear models that the arguments of a command define."""
 
 from __future__ import annotations
 
-import argparse
 import warnings
+from argparse import Namespace
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import fflin
 from fflin.base.errors import FflinWarning, InputError, located
+from fflin.base.names import joints_by_name, rates_by_name
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.base.validation import Array
     from fflin.dynamics.state import Frame
-    from fflin.linear.model import LinearModel
     from fflin.robot.inputs import Input
-    from fflin.robot.robot import Robot
+
+T = TypeVar("T")
 
 
-def load_robot(arguments: argparse.Namespace) -> Robot:
+def load_robot(arguments: Namespace) -> fflin.Robot:
     """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
-    from fflin.robot.loading import load
-
-    lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
-    first: dict[str, Any] = {"passive": passive} if passive else {}
-    if getattr(arguments, "damping", None) == [(None, "urdf")]:
+    given = {
+        name: value
+        for name in ("passive", "gravity", "orbit", "stiffness", "damping")
+        if (value := getattr(arguments, name, None))
+    }
+    # These settings change the warnings of `load`.
+    first = {"passive": given.pop("passive")} if "passive" in given else {}
+    if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
-    robot = load(arguments.robot, lock=lock, **first)
-    given = {name: getattr(arguments, name, None) for name in ("gravity", "orbit")}
-    fields: dict[str, object] = {name: value for name, value in given.items() if value}
-    for name in ("stiffness", "damping"):
-        values = getattr(arguments, name, [])
-        for_all = [value for joint, value in values if joint is None]
-        if for_all and len(values) > 1:
+    robot = fflin.load(arguments.robot, lock=once("--lock", arguments.lock), **first)
+    for name in {"stiffness", "damping"} & {*given}:
+        for_all = [value for joint, value in given[name] if joint is None]
+        if for_all and len(given[name]) > 1:
             raise InputError(
                 f"--{name} is given for all joints and for single joints; give only one of them"
             )
-        if values:
-            fields[name] = for_all[0] if for_all else once(f"--{name}", values)
+        given[name] = for_all[0] if for_all else once(f"--{name}", given[name])
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         with located(arguments.inputs):  # a name or an inertia that this robot does not accept
             robot = robot.replace(inputs=inputs)
-    if getattr(arguments, "output", []):
-        from fflin.robot.outputs import parse_output
-
-        fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
-    return robot.merged(fields)
+    if outputs := getattr(arguments, "output", None):
+        given["outputs"] = outputs
+    return robot.merged(given)
 
 
-def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
-    from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque
-
+def _inputs(robot: fflin.Robot, name: str) -> tuple[Input, ...]:
     if name == "joints":
         if not robot.n:
             raise InputError(f"--inputs joints: '{robot.name}' has no joints")
-        return (JointTorque("*"),)
+        return (fflin.JointTorque("*"),)
     if name == "base":
-        return BaseTorque(), BaseForce()
-    from fflin.robot.robot_files import load_inputs
-
-    return load_inputs(name)
+        return fflin.BaseTorque(), fflin.BaseForce()
+    return fflin.load_inputs(name)
 
 
-def limits_of_options(arguments: argparse.Namespace) -> Any:
+def limits_of_options(
+    arguments: Namespace,
+) -> list[str | dict[str, float]] | dict[str, float] | None:
     """Return the limits that --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 
 
-def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
     """Raise an error if options are given that have no effect in combination with others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
-def once(option: str, pairs: list[tuple[str, object]]) -> dict[str, Any]:
+def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
     """Return {name: value} of a repeatable option; raise an error if a name is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
@@ -86,37 +83,27 @@ def once(option: str, pairs: list[tuple[str, object]]) -> dict[str, Any]:
     return values
 
 
-def configuration_of(
-    robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], prefix: str = ""
-) -> Array:
-    """Return q (nq,) of a robot's state, overridden by --joint, --rpy and --position.
+def state_of(
+    robot: fflin.Robot, arguments: Namespace, state: Mapping[str, Any], prefix: str = ""
+) -> tuple[Array, Array | None]:
+    """Return q (nq,) and v (nv,) of a robot's state, which the options of a command override.
 
-    The option names may have a prefix, such as ``target_``.
+    The options --joint, --rpy, --position and --velocity may have a prefix, such as ``target_``.
+    Warn about exceeded limits of joints.
     """
     from fflin.dynamics.points import base_of
 
-    given = {name: getattr(arguments, f"{prefix}{name}") for name in ("rpy", "position")}
-    base = base_of({**state, **{name: x for name, x in given.items() if x is not None}})
-    pairs = getattr(arguments, f"{prefix}joint")
-    option = f"--{prefix}joint".replace("_", "-")
-    return placed(robot, option, pairs, base, state.get("joints"))
-
-
-def placed(
-    robot: Robot,
-    option: str,
-    pairs: list[tuple[str, object]],
-    base: pin.SE3 | None = None,
-    of_state: Mapping[str, float] | None = None,
-) -> Array:
-    """Return q (nq,) of a state's joints, overridden by an option; warn about exceeded limits."""
-    from fflin.base.names import joints_by_name
-    from fflin.dynamics.points import configuration
-
-    joints = dict(of_state or {}) | joints_by_name(
-        "joint", once(option, pairs), robot.joint_names, lambda name: robot.joint(name).name
-    )
-    q = configuration(robot, joints, base)
+    given = {
+        name: value
+        for name in ("rpy", "position", "joint", "velocity")
+        if (value := getattr(arguments, f"{prefix}{name}", None)) is not None
+    }
+    option = f"--{prefix}".replace("_", "-")
+    values = once(f"{option}joint", given.pop("joint"))
+    rates = once(f"{option}velocity", given.pop("velocity", []))
+    named = joints_by_name("joint", values, robot.joint_names, lambda key: robot.joint(key).name)
+    joints = {**state.get("joints", {}), **named}
+    q = fflin.configuration(robot, joints, base_of({**state, **given}))
     model = robot.model
     for joint in robot.joints:
         if joint.name not in joints or joint.unbounded:
@@ -129,84 +116,77 @@ def placed(
                 FflinWarning,
                 stacklevel=2,
             )
-    return q
-
-
-def linear_model(
-    arguments: argparse.Namespace, robot: Robot | None = None
-) -> tuple[Robot, LinearModel]:
-    """Return the robot and its linear model about the operating point of the arguments."""
-    from fflin.linear.linearization import linearize
-
-    robot, q, v, reference = point_of(arguments, robot)
-    q, u, reference = held_at(robot, q, v, arguments, reference)
-    return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
+    fflin.velocity(robot, rates)  # raises an error if it is invalid
+    rates = {**state.get("velocity", {}), **rates_by_name(robot.joint_names, rates)}
+    return q, fflin.velocity(robot, rates) if rates else None
 
 
 def point_of(
-    arguments: argparse.Namespace, robot: Robot | None = None
-) -> tuple[Robot, Array, Array | None, pin.SE3 | None]:
-    """Return the robot, and q (nq,), v (nv,) and the reference of the operating point."""
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[Array, Array | None, pin.SE3 | None]:
+    """Return q (nq,), v (nv,) and the reference of the operating point."""
+    refuse_pose(arguments)
+    return *state_of(robot, arguments, robot.point), reference_of(arguments)
+
+
+def reference_of(arguments: Namespace) -> pin.SE3 | None:
+    """Return the pose of --reference; None is the base pose at the operating point."""
     import pinocchio as pin
 
-    robot = robot or load_robot(arguments)
-    q = configuration_of(robot, arguments, robot.point)
-    v = velocity_of(robot, arguments, robot.point, "velocity")
-    refuse_pose(arguments)
-    return robot, q, v, pin.SE3.Identity() if arguments.reference == "world" else None
+    return pin.SE3.Identity() if arguments.reference == "world" else None
 
 
-def refuse_pose(arguments: argparse.Namespace, prefix: str = "") -> None:
+def refuse_pose(arguments: Namespace, prefix: str = "") -> None:
     """Raise an error if --relative-equilibrium is combined with --rpy or --position."""
-    if arguments.relative_equilibrium:
+    if getattr(arguments, "relative_equilibrium", None):
         names = (f"{prefix}rpy", f"{prefix}position")
         refuse(arguments, names, "--relative-equilibrium already sets the base pose")
 
 
-def velocity_of(
-    robot: Robot, arguments: argparse.Namespace, state: Mapping[str, Any], *options: str
-) -> Array | None:
-    """Return the velocity (nv,) of a robot's state; each option overrides the values before it."""
-    from fflin.base.names import rates_by_name
-    from fflin.dynamics.points import velocity
-
-    values: dict[str, float] = dict(state.get("velocity", {}))
-    for option in options:
-        given = once(f"--{option.replace('_', '-')}", getattr(arguments, option))
-        velocity(robot, given)  # raises an error if it is invalid
-        values |= rates_by_name(robot.joint_names, given)
-    return velocity(robot, values) if values else None
+def linear_model(
+    arguments: Namespace, robot: fflin.Robot | None = None
+) -> tuple[fflin.Robot, fflin.LinearModel]:
+    """Return the robot and its linear model about the operating point of the arguments."""
+    robot = robot or load_robot(arguments)
+    return robot, model_about(robot, arguments, *point_of(robot, arguments))
 
 
-def held_at(
-    robot: Robot,
+def model_about(
+    robot: fflin.Robot,
+    arguments: Namespace,
     q: Array,
     v: Array | None,
-    arguments: argparse.Namespace,
     reference: pin.SE3 | None = None,
-) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q, u (nu,) and the reference, with the inputs of --effort or of an equilibrium."""
-    number = arguments.relative_equilibrium
-    if not arguments.equilibrium and not number:
-        from fflin.dynamics.points import effort
-
-        given = once("--effort", arguments.effort)
-        return q, effort(robot, given) if given else None, reference
-    which = "--relative-equilibrium" if number else "--equilibrium"
-    refuse(arguments, ("effort",), f"{which} already sets the inputs at the operating point")
-    from fflin.linear.equilibrium import equilibrium
-
+) -> fflin.LinearModel:
+    """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium."""
+    number, axes = arguments.relative_equilibrium, arguments.frame
+    u: Array | None
     if number:
-        q, reference = attitude(robot, q, number, arguments.frame)
-    held = equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference)
-    return held.q, held.u, reference
+        q, reference = attitude(robot, q, number, axes)
+    if number or arguments.equilibrium:
+        which = "--relative-equilibrium" if number else "--equilibrium"
+        refuse(arguments, ("effort",), f"{which} already sets the inputs at the operating point")
+        held = fflin.equilibrium(robot, q, v=v, frame=axes, reference=reference)
+        q, u = held.q, held.u
+    else:
+        given = once("--effort", arguments.effort)
+        u = fflin.effort(robot, given) if given else None
+    return fflin.linearize(robot, q, v, u, frame=axes, reference=reference)
 
 
-def attitude(robot: Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
+def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
     """Return q (nq,) and the base placement of the relative equilibrium `number`, from 1 to 24."""
     import pinocchio as pin
 
-    from fflin.analysis.relative_equilibria import relative_equilibria
-
-    q = relative_equilibria(robot, q, frame=frame)[number - 1].q
+    q = fflin.relative_equilibria(robot, q, frame=frame)[number - 1].q
     return q, pin.XYZQUATToSE3(q[:7])
+
+
+def models_along(arguments: Namespace, robot: fflin.Robot | None = None) -> fflin.LinearTrajectory:
+    """Return the linear models along the trajectory in the arguments."""
+    point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
+    refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
+    robot = robot or load_robot(arguments)
+    settings = {"hold": arguments.hold, "frame": arguments.frame}
+    motion = fflin.Trajectory.load(arguments.trajectory, robot, **settings)
+    return fflin.linearize_trajectory(robot, motion, strict=arguments.strict)

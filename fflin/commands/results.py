@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
 
+import fflin
 from fflin.base import __version__
 from fflin.base.errors import FileError
 from fflin.base.tables import first_paragraph, headed
@@ -26,6 +26,7 @@ _ENTRIES = {
     "LinearModel": {"urdf_sha256", "certificate"},
     "LinearBatch": {"header", "B_lower"},
     "Campaign": {"header", "drawn"},
+    "Motion": {"t [s]", "q_b.x"},
 }
 
 
@@ -84,17 +85,6 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
     return report.code
 
 
-def figure_of(name: str, drawn: object) -> Callable[[Path], object]:
-    """Return a function that saves a figure of `drawn`, made by the public function `name`."""
-
-    def save(path: Path) -> None:
-        import fflin
-
-        getattr(fflin, name)(drawn, path)
-
-    return save
-
-
 def _wrote(path: Path) -> str:
     size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
     return f"wrote {path}{size}"
@@ -102,17 +92,19 @@ def _wrote(path: Path) -> str:
 
 def _record(command: str, report: Report, files: list[Path]) -> dict[str, object]:
     """Return the JSON object of --json: entries of every command, then the fields of the result."""
-    head = {
+    head: dict[str, object] = {
         "fflin": __version__,
         "command": command,
         "robot": report.robot,
         "result": first_paragraph(report.text),
         "files": [str(path) for path in files],
     }
-    return head | {key: x for key, x in plain(report.result).items() if key not in head}
+    result = plain(report.result)
+    assert isinstance(result, dict)
+    return head | result | head
 
 
-def plain(value: object) -> Any:
+def plain(value: object) -> object:
     """Convert a value for JSON: arrays to lists, results to objects, infinity and NaN to null."""
     import numpy as np
 
@@ -128,26 +120,25 @@ def plain(value: object) -> Any:
     return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
-def _fields(value: object) -> Any:
+def _fields(value: object) -> object:
     """Return the fields of a result; a result that can be saved has the fields of its file."""
     from fflin.base.record import Design, record_of
     from fflin.linear.files import record_of as record_of_model
-    from fflin.linear.model import LinearModel
 
-    if isinstance(value, LinearModel):
+    if isinstance(value, fflin.LinearModel):
         return record_of_model(value)
     if isinstance(value, Design):
         return record_of(value)
     if is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
         # The model in a result is omitted, because it is a separate result.
-        return {key: x for key, x in own.items() if not isinstance(x, LinearModel)}
+        return {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
     return value._asdict() if hasattr(value, "_asdict") else value
 
 
 def require_own_kind(arguments: argparse.Namespace) -> None:
     """Raise `FileError` if -o would replace a file of another kind."""
-    path, kinds = getattr(arguments, "output_file", None), getattr(arguments, "kinds", ())
+    path, kinds = getattr(arguments, "output_file", None), arguments.command.kinds
     if path is None or not kinds or arguments.force:
         return
     if path.suffix == ".csv" and "LinearModel" in kinds:
@@ -168,31 +159,26 @@ def require_own_kind(arguments: argparse.Namespace) -> None:
 
 def kind_of(path: Path) -> str:
     """Return the class name of the result in a file, or "" if the class is unknown."""
+    import numpy as np
+
+    from fflin.base.record import decoded, text
+
+    kind = ""
     try:
-        names, kind = _entries(path)
+        if path.suffix == ".csv":
+            with path.open(encoding="utf-8") as file:
+                names = {*file.readline().strip().split(",")}
+        elif path.suffix == ".h5":
+            from fflin.batch.files import hdf5
+
+            with hdf5().File(path, "r") as file:
+                names = {*file, *file.attrs}
+        elif path.suffix == ".npz":
+            with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
+                names, kind = {*entries}, text(entries.get("kind", ""))
+        else:
+            entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` registers an input
+            names, kind = {*entries}, text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types
         return ""
     return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")
-
-
-def _entries(path: Path) -> tuple[set[str], str]:
-    """Return the names of a file's entries, and the kind of its result or ""."""
-    from fflin.base.record import decoded, text
-
-    entries: Any
-    if path.suffix == ".csv":
-        with path.open(encoding="utf-8") as file:
-            names = {*file.readline().strip().split(",")}
-        return names, "Motion" if {"t [s]", "q_b.x"} <= names else ""
-    if path.suffix == ".h5":
-        from fflin.batch.files import hdf5
-
-        with hdf5().File(path, "r") as file:
-            return {*file, *file.attrs}, ""
-    if path.suffix == ".npz":
-        import numpy as np
-
-        with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
-            return {*entries.files}, text(entries["kind"]) if "kind" in entries.files else ""
-    entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` would register an input
-    return {*entries}, text(entries["kind"]) if "kind" in entries else ""

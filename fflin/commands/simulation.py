@@ -1,157 +1,66 @@
-"""Commands `plan`, `simulate` and `montecarlo`: plan a trajectory, simulate one or many motions."""
+"""Commands `plan`, `simulate` and `view`, and the control loops that commands simulate."""
 
 from __future__ import annotations
 
-import argparse
-from functools import cache, partial
+import sys
+from argparse import Namespace
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FileError, InputError
-from fflin.base.names import chosen, input_keys
-from fflin.base.tables import folded
-from fflin.commands import DONE, FELL_SHORT, options, parser
-from fflin.commands.loops import add_loop, loop_of, target_of
-from fflin.commands.points import configuration_of, limits_of_options, load_robot, once, velocity_of
-from fflin.commands.results import Report, figure_of
-from fflin.commands.sweeps import going_on
-from fflin.commands.visual import add_pictures, check_pictures, pictures
+import fflin
+from fflin.base.errors import InputError
+from fflin.base.names import chosen, input_keys, rates_by_name
+from fflin.commands import DONE, FELL_SHORT
+from fflin.commands.points import (
+    attitude,
+    limits_of_options,
+    load_robot,
+    model_about,
+    models_along,
+    once,
+    refuse,
+    refuse_pose,
+    state_of,
+)
+from fflin.commands.regulator import (
+    gain_of,
+    regulated_part,
+    robot_of_design,
+    schedule_of,
+    weights_of,
+)
+from fflin.commands.results import Report
 
 if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
-    from fflin.simulation.motion import Motion
+    import pinocchio as pin
 
-_ROWS = 240  # rows of errors and inputs in a figure
-_PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
+    from fflin.base.validation import Array
+    from fflin.control.mpc import Mpc
 
+_WEIGHTS = ("weights", "q", "r", "bryson", "sample")
+_POSE = ("target_rpy", "target_position")
+_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
 
-def add_commands(commands: parser.Commands) -> None:
-    """Add the commands plan, simulate and montecarlo."""
-    _add_plan(commands)
-    _add_simulate(commands)
-    _add_montecarlo(commands)
+_FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
 
-def _add_plan(commands: parser.Commands) -> None:
-    plan = parser.command(
-        commands,
-        _plan,
-        "joint rpy position velocity target-joint target-rpy target-position target-velocity "
-        "duration knots hold free-end r limits limit inputs output-file",
-    )
-    options.add_robot(plan)
-    options.add_system(plan)
-    options.add_pose(plan.group("start"))
-    options.add_target(plan.group("target"))
-    group = plan.group(parser.TRAJECTORY)
-    group.add("--duration", "duration of the motion [s]", float, "T", required=True)
-    group.add("--knots", "number of equally spaced knots", int, default=101)
-    hold = "inputs between knots: constant (previous, default) or linearly interpolated (linear)"
-    group.add("--hold", hold, choices=("previous", "linear"), default="previous")
-    free = "state whose final value is free. NAME is a state, group or pattern"
-    group.add("--free-end", free, metavar="NAME", repeatable=True)
-    weight = "weight on an input, a group or a pattern. The default is 1/limit^2"
-    group.add("--r", weight, parser.assignment, "NAME=W", repeatable=True)
-    options.add_limits(group)
-    options.add_output_file(
-        plan.group(parser.OUTPUT), "the trajectory", parser.TABLE, "Trajectory", "Motion"
-    )
-    # The functions for start and target read these options, which only other commands have, so they
-    # need a value here.
-    plan.set_defaults(relative_equilibrium=None)
-
-
-def _add_simulate(commands: parser.Commands) -> None:
-    simulate = parser.command(
-        commands,
-        _simulate,
-        "joint rpy target-joint target-rpy trajectory weights q r sample mpc gain schedule "
-        "free limits duration inputs output-file plot html",
-    )
-    add_loop(simulate)
-    simulate.group(parser.SIMULATION).add(
-        "--every",
-        "save the state at every N-th integration step; by default N is 1, or larger for long runs",
-        int,
-    )
-    simulate.group(parser.SIMULATION).add(
-        "--engine",
-        "simulate in compiled code or in Python. By default, long runs use compiled code if "
-        "numba is installed, and all other runs use Python",
-        choices=("compiled", "python"),
-    )
-    options.add_figure(simulate, "the nonlinear and the linear motion")
-    shown = simulate.group(parser.OUTPUT)
-    shown.add(
-        "--show",
-        "show only these curves in --plot. NAME is a state, input, group or pattern, such as q_m "
-        "or '*.hinge_*'",
-        metavar="NAME",
-        repeatable=True,
-    )
-    options.add_output_file(shown, "the motion", parser.TABLE, "Motion")
-    add_pictures(simulate)
-
-
-def _simulate(arguments: argparse.Namespace) -> Report:
-    """Simulate the robot with a regulator to a target or along a trajectory.
-
-    example: fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png
-    """
-    from fflin.simulation.report import motion_record, motion_report
-
-    robot = load_robot(arguments)
-    check_pictures(robot, arguments)
-    if arguments.show:
-        from fflin.linear.linearization import linearize
-
-        lin = linearize(robot)
-        chosen("state or input", arguments.show, (*lin.state_names, *input_keys(lin)))
-    try:
-        motion = simulated(robot, arguments)
-    except InputError as error:
-        hint = " (--sample)" if "needs sampled commands" in str(error) else ""
-        raise InputError(f"{error}{hint}") from None
-    return Report(
-        robot.name,
-        motion_record(motion),
-        motion_report(motion),
-        {
-            arguments.output_file: motion.save,
-            arguments.plot: partial(motion.plot, show=arguments.show or None),
-            **pictures(robot, lambda: motion, arguments),
-        },
-        FELL_SHORT if motion.stopped else DONE,
-        motion.stopped if motion.stopped.startswith("interrupted") else "",
-    )
-
-
-def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
-    """Return the motion that the arguments define."""
-    from fflin.simulation.simulate import simulate
-
-    loop = loop_of(robot, arguments)
-    # A continuous model predicts all rows of the motion, a sampled model only the rows at its
-    # samples.
-    shown = {"every": arguments.every, "engine": arguments.engine}
-    return simulate(robot, loop.policy, **shown, **loop.options, **loop.prediction)
-
-
-def _plan(arguments: argparse.Namespace) -> Report:
+def plan(arguments: Namespace) -> Report:
     """Plan a low-effort trajectory between two states within limits.
 
     example: fflin plan planar_detumble --target-joint joint_1=0.3 --duration 20 -o plan.npz
     """
-    from fflin.control.plan import plan
     from fflin.dynamics.points import combined
 
     robot = load_robot(arguments)
-    state = combined(robot.point, robot.start)
-    motion = plan(
+    q0, v0 = state_of(robot, arguments, combined(robot.point, robot.start))
+    motion = fflin.plan(
         robot,
         target_of(robot, arguments),
         arguments.duration,
-        q0=configuration_of(robot, arguments, state),
-        v0=velocity_of(robot, arguments, state, "velocity"),
+        q0=q0,
+        v0=v0,
         knots=arguments.knots,
         hold=arguments.hold,
         limits=limits_of_options(arguments),
@@ -161,88 +70,234 @@ def _plan(arguments: argparse.Namespace) -> Report:
     return Report(robot.name, motion, str(motion), {arguments.output_file: motion.save})
 
 
-def _add_montecarlo(commands: parser.Commands) -> None:
-    montecarlo = parser.command(
-        commands,
-        _montecarlo,
-        "runs seed until width confidence workers goal worst joint rpy trajectory gain "
-        "schedule duration inputs output-file plot",
-    )
-    add_loop(montecarlo)
-    montecarlo.add_argument(
-        "dispersions",
-        metavar="DISPERSIONS",
-        type=parser.input_file,
-        help='TOML file with a line [dispersions], and a line such as "base.mass" = 0.05 '
-        "(standard deviation) for each random parameter; see fflin.load_dispersions",
-    )
-    runs = montecarlo.group("runs")
-    runs.add("--runs", "number of runs", int, required=True)
-    runs.add("--seed", "random seed", parser.whole, "S", default=0)
-    runs.add(
-        "--until",
-        "stop the runs when the confidence interval of the success rate is at most --width wide. "
-        "CONDITION defines success, such as 'attitude < 1 deg'",
-        metavar="CONDITION",
-    )
-    width = "width of the confidence interval at which --until stops the runs"
-    runs.add("--width", width, float, "P", default=0.02)
-    runs.add("--confidence", "confidence level of all intervals", float, "P", default=0.95)
-    runs.add("--workers", "distribute the runs over N processes", int)
-    threads = "distribute the runs over N threads; by default one per core"
-    runs.add("--threads", threads, int)
-    shown = montecarlo.group(parser.OUTPUT)
-    shown.add(
-        "--goal",
-        "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg and settle < "
-        "60 s', and draw the bounds of CONDITION in --plot",
-        metavar="CONDITION",
-        repeatable=True,
-    )
-    shown.add("--worst", "list the K worst runs", parser.whole, "K", default=3)
-    options.add_figure(montecarlo, "quantile bands over time, histograms and the worst runs")
-    what = (
-        "the runs (.csv and .mat are tables for other programs; with .h5, the same command resumes "
-        "after an interruption)"
-    )
-    force = "replace the file of -o even if it contains the runs of another command"
-    options.add_output_file(shown, what, parser.RUNS)
-    shown.switch("--force", force)
-    add_pictures(montecarlo, "that plays the worst run")
+def simulate(arguments: Namespace) -> Report:
+    """Simulate the robot with a regulator to a target or along a trajectory.
 
-
-def _montecarlo(arguments: argparse.Namespace) -> Report:
-    """Simulate a loop with random parameters; show quantiles, success rates and the worst runs.
-
-    example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
+    example: fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png
     """
-    from fflin.campaign.monte_carlo import monte_carlo
-    from fflin.campaign.report import campaign_record, worst_runs
-    from fflin.campaign.spreads import load_dispersions
-    from fflin.control.policies import bound
+    from fflin.simulation.report import motion_record, motion_report
 
-    path = arguments.output_file
-    is_table = path is not None and path.suffix in (".csv", ".mat")
-    if is_table and path.exists() and not arguments.force:
-        raise FileError(f"{path} already exists; give another file name, or add --force")
-    dispersions = load_dispersions(arguments.dispersions)
-    robot = load_robot(arguments)
+    robot, show = load_robot(arguments), arguments.show
     check_pictures(robot, arguments)
-    loop = loop_of(robot, arguments)
-    settings: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
-    settings |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
-    with going_on(path, "runs") as progress:
-        settings |= {"progress": progress, "out": None if is_table else path}
-        settings["overwrite"] = arguments.force
-        campaign = monte_carlo(robot, loop.policy, dispersions, **settings)
-    worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
-    files = {
-        path: campaign.save if is_table else None,
-        arguments.plot: figure_of("plot_campaign", campaign),
-        **pictures(robot, worst, arguments),
+    if show:
+        lin = fflin.linearize(robot)
+        chosen("state or input", show, (*lin.state_names, *input_keys(lin)))
+    policy, settings = loop_of(robot, arguments)
+    try:
+        motion = fflin.simulate(
+            robot, policy, every=arguments.every, engine=arguments.engine, **settings
+        )
+    except InputError as error:
+        hint = " (--sample)" if "needs sampled commands" in str(error) else ""
+        raise InputError(f"{error}{hint}") from None
+    files: dict[Path | None, Callable[[Path], object] | None] = {
+        arguments.output_file: motion.save,
+        arguments.plot: partial(motion.plot, show=show or None),
+        **pictures(robot, lambda: motion, arguments),
     }
-    notes = getattr(bound(loop.policy, robot), "notes", ()) if loop.policy else ()
-    shown = [str(campaign), *(folded([note]) for note in notes)]
-    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
-    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
-    return Report(robot.name, result, text, files)
+    code = FELL_SHORT if motion.stopped else DONE
+    interrupted = motion.stopped if motion.stopped.startswith("interrupted") else ""
+    text = motion_report(motion)
+    return Report(robot.name, motion_record(motion), text, files, code, interrupted)
+
+
+def view(arguments: Namespace) -> Report:
+    """Show a robot live in the browser with a slider for each joint.
+
+    example: fflin view servicer_7dof --joint joint_2=0.4
+    """
+    from fflin.dynamics.points import combined
+    from fflin.view.live import Live
+
+    robot = load_robot(arguments)
+    q, _ = state_of(robot, arguments, combined(robot.point, robot.start))
+    how = {name: getattr(arguments, name) for name in (*_SHOWN, "frame")}
+    live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
+    assert isinstance(live, Live)  # since there is no motion
+    print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    if not arguments.no_open:
+        live.open()
+    live.wait()
+    return Report(robot.name, {}, f"{robot.name}: the view is closed")
+
+
+def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
+    """Raise an error before the simulation if `pictures` would refuse the options."""
+    from fflin.simulation.plan import LONGEST
+    from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
+
+    if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
+        return
+    check_tool(robot, arguments.tool)
+    duration = arguments.duration or LONGEST
+    check_rates(arguments.fps, arguments.speed, duration)
+    if arguments.times:
+        check_times(arguments.times, 0.0, duration)
+
+
+def pictures(
+    robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
+) -> dict[Path | None, Callable[[Path], object]]:
+    """Return {path: function that writes the file} for the files that display a motion."""
+    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
+
+    def show(path: Path) -> None:
+        fflin.visualize(robot, motion(), **how | {path.suffix.removeprefix("."): path})
+
+    return {getattr(arguments, name): show for name in _FILES}
+
+
+def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
+    """Return the policy that the arguments define, and the options of `fflin.simulate`."""
+    from fflin.simulation.plan import SHORTEST, time_to_settle
+
+    settings: dict[str, Any] = {
+        **{name: getattr(arguments, name) for name in ("dt", "method", "delay", "duration")},
+        "limits": limits_of_options(arguments),
+    }
+    if not arguments.controller:
+        refuse(arguments, ("negative_feedback",), "only --controller has a sign of the feedback")
+    if arguments.trajectory or arguments.schedule:
+        design = robot_of_design(robot, bool(arguments.allocate))
+        tracking = along(design, arguments)
+        if offset := once("--offset", arguments.offset):
+            settings["q0"], settings["v0"] = tracking.beside(offset)
+        return fflin.Allocation(tracking, design) if arguments.allocate else tracking, settings
+    refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
+    if arguments.free:
+        of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
+        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
+        refuse(arguments, names, "with --free there is no regulator and all inputs are zero")
+        q, v = start_of(robot, arguments)
+        if arguments.duration is None:
+            settings["duration"] = SHORTEST
+        return None, settings | {"q0": q, "v0": v, "frame": arguments.frame}
+    policy, linear, lin = about_point(robot, arguments)
+    q, v = start_of(robot, arguments, linear.lin.reference)
+    if arguments.duration is None:
+        settings["duration"] = time_to_settle(robot, linear, q, v)
+    return policy, settings | {"q0": q, "v0": v, "linear": lin}
+
+
+def start_of(
+    robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
+) -> tuple[Array, Array | None]:
+    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
+    from fflin.dynamics.points import combined
+
+    point, number = robot.point, arguments.relative_equilibrium
+    if number:  # the start is relative to this pose, which replaces the pose of the point
+        point = {part: point[part] for part in ("joints", "velocity") if part in point}
+    rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
+    state = combined(combined(point, {"velocity": rates}), robot.start)
+    q, v = state_of(robot, arguments, state)
+    if number:
+        import pinocchio as pin
+
+        about = reference or attitude(robot, q, number, arguments.frame)[1]
+        q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
+    return q, v
+
+
+def about_point(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
+    """Return the policy about a point, its linear feedback, and the model that predicts the motion.
+
+    The model is None if the prediction would not contain every row of the motion.
+    """
+    gain: fflin.Gain | None = None
+    feedback: fflin.StateFeedback | fflin.LinearController
+    if arguments.mpc:
+        names = ("allocate", "gain", "controller", "reduce")
+        refuse(arguments, names, "--mpc replaces the regulator and its options")
+        arguments.allocate = False
+    if arguments.gain:
+        why = "the file of --gain already contains the weights and the operating point"
+        refuse(arguments, (*_WEIGHTS, *_TARGETS), why)
+        gain = fflin.Gain.load(arguments.gain)
+    design = robot_of_design(robot, arguments.allocate, gain)
+    if gain:
+        lin = _about_gain(design, gain, arguments)
+    else:
+        lin = model_about(design, arguments, *target_of(design, arguments))
+        lin = regulated_part(lin, arguments)
+    if arguments.mpc:
+        by = _mpc(lin, arguments)
+        return by, fflin.StateFeedback(by.lin, by.gain.K), None
+    if arguments.controller:
+        of_gain = (*_WEIGHTS, "gain", "reduce")
+        refuse(arguments, of_gain, "--controller replaces the regulator and its options")
+        sign = -1.0 if arguments.negative_feedback else 1.0
+        feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
+    else:
+        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
+        feedback = fflin.StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+    if design is not robot:
+        return fflin.Allocation(feedback, design), feedback, None
+    return feedback, feedback, None if arguments.reduce or arguments.controller else lin
+
+
+def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
+    """Return the predictive controller with the weights and limits of the arguments."""
+    from fflin.control.mpc import Mpc
+    from fflin.control.weights import rule_weights
+
+    if (sample := arguments.sample) is None:
+        raise InputError("--mpc needs the sample time of the controller; add --sample H")
+    settings: dict[str, Any] = {"weights": arguments.weights}
+    if given := weights_of(arguments):
+        Q, R, _, _ = rule_weights(lin.discretize(sample), arguments.weights, given)
+        settings = {"Q": Q, "R": R}
+    limits = limits_of_options(arguments)
+    by = fflin.mpc(lin, horizon=arguments.horizon, dt=sample, limits=limits, **settings)
+    assert isinstance(by, Mpc)  # since the model is about a point
+    return by
+
+
+def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
+    """Return the feedback along the trajectory of --trajectory or --schedule."""
+    regulator = ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS)
+    why = (
+        "the trajectory defines the regulator, its target, and the start, which --offset displaces"
+    )
+    refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
+    if arguments.schedule is None:
+        models = models_along(arguments, robot)
+        return fflin.TrajectoryFeedback(models, schedule_of(models, arguments))
+    why = "the file of --schedule already contains the trajectory and the design of its gains"
+    refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
+    schedule = fflin.GainSchedule.load(arguments.schedule)
+    return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
+
+
+def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
+    """Return the linear model about the operating point of a gain.
+
+    If the operating point is at its own reference, the target pose of the base is the reference.
+    """
+    from fflin.dynamics.actuation import Actuation
+    from fflin.linear.fit import require_same
+
+    made = f"{arguments.gain} was made for '{gain.robot}'"
+    frame: Any = gain.frame
+    state, reference = fflin.StateMap(robot, frame=frame), None
+    for kind, there in (("state", state), ("input", Actuation(state))):
+        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
+        require_same(made, robot, kind, own, (there.names, there.units))
+    q, v = state.to_pinocchio(gain.x0)
+    if gain.x0[:6].any():
+        refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
+    else:
+        q[:7] = target_of(robot, arguments)[0][:7]
+    if number := arguments.relative_equilibrium:
+        q, reference = attitude(robot, q, number, frame)
+    return fflin.linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
+
+
+def target_of(robot: fflin.Robot, arguments: Namespace) -> tuple[Array, Array | None]:
+    """Return the target q (nq,) and v (nv,), by default the operating point of the robot."""
+    from fflin.dynamics.points import combined
+
+    refuse_pose(arguments, "target_")
+    return state_of(robot, arguments, combined(robot.point, robot.target), "target_")

@@ -20,16 +20,20 @@ from fflin.robot.robot import Robot
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 
 
-def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` if a model's states or inputs differ from the robot's."""
+def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
+    """Raise `InputError` if a model's states or inputs differ from the robot's.
+
+    A reduced model may lack states of the robot, unless the model must be `whole`.
+    """
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    # A reduced model may lack states of the robot, so only its own states are compared.
-    units = dict(zip(state.names, state.units, strict=True))
-    there = tuple(name for name in lin.state_names if name in units)
-    states = (lin.state_names, lin.state_units)
-    require_same(made, robot, "state", states, (there, tuple(units[name] for name in there)))
+    there = state.names, state.units
+    if not whole:
+        units = dict(zip(*there, strict=True))
+        names = tuple(name for name in lin.state_names if name in units)
+        there = names, tuple(units[name] for name in names)
+    require_same(made, robot, "state", (lin.state_names, lin.state_units), there)
     require_turns(made, len(lin.q), robot)
 
 

@@ -20,9 +20,9 @@ from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
+from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, at_rest, drift, output_equations
-from fflin.linear.verification import certify, inertia_matrix
 from fflin.robot.fields import magnitudes_of
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import require_inertia, rotor_names

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
@@ -302,16 +302,17 @@ class ReactionWheel(WrenchInput):
 KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, ReactionWheel)
 
 
-def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
+def three_numbers(what: str, value: object) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` with the given value."""
+    entries = value if isinstance(value, Iterable) else ()
     try:
-        x, y, z = (number(what, entry) for entry in value)
-    except (TypeError, ValueError):
+        x, y, z = (number(what, entry) for entry in entries)
+    except ValueError:
         raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
     return x, y, z
 
 
-def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
+def unit_vector(what: str, value: object, hint: str) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
     length = math.hypot(x, y, z)

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, with_appendages
 from fflin.robot.equipment.mounting import stored_momentum
-from fflin.robot.fields import Range, checked_fields, checked_passive
+from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
@@ -243,18 +243,26 @@ class Robot(Coordinates):
         """Return a copy with other fields; joints and limits that are not named keep theirs."""
         if self.passive and isinstance(given := fields.get("passive"), list | tuple):
             fields = {**fields, "passive": [*self.passive, *given]}
-        return self._replaced({**fields}, merged=True)
+        return self._replaced(fields, merged=True)
 
-    def _replaced(self, fields: dict[str, object], *, merged: bool) -> Robot:
+    def _replaced(self, fields: Mapping[str, object], *, merged: bool) -> Robot:
         self.require_unchanged()
+        require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            robot = robot._without_motors(fields.pop("passive"))
+            passive = checked_passive(fields["passive"], self._bare)
+            inputs = [x for x in self.inputs if getattr(x, "joint", None) not in passive]
+            if not inputs:
+                raise InputError(
+                    "all inputs are torques of passive joints; a model needs at least one input"
+                )
+            robot = replace(self, passive=passive, inputs=tuple(inputs))
         if "inputs" in fields:
-            robot = equipped(robot, inputs=fields.pop("inputs"))
+            robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
-            robot = with_appendages(robot, fields.pop("appendages"))
-        checked = checked_fields(fields, robot)
+            robot = with_appendages(robot, fields["appendages"])
+        own = ("passive", "inputs", "appendages")
+        checked = {k: FIELDS[k](value, robot) for k, value in fields.items() if k not in own}
         # Without `merged`, only modes keep their values unless they are named.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
@@ -468,14 +476,3 @@ class Robot(Coordinates):
     def _bare(self) -> Robot:
         """The robot without its wheels and modes; itself if it has none."""
         return self._unequipped or self
-
-    def _without_motors(self, passive: object) -> Robot:
-        """Return the robot without the torque inputs of passive joints."""
-        bare = self._bare
-        joints = checked_passive(passive, bare.joint, bare.joint_names)
-        inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
-        if not inputs:
-            raise InputError(
-                "all inputs are torques of passive joints; a model needs at least one input"
-            )
-        return replace(self, passive=joints, inputs=inputs)

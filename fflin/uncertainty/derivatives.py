@@ -22,10 +22,10 @@ from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
+from fflin.linear.check import aba_route
 from fflin.linear.linearization import own_reference, prepare
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, output_equations
-from fflin.linear.verification import aba_route
 from fflin.robot.joints import ROOT
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
@@ -174,7 +174,7 @@ class ModelDerivatives:
             change_bodies(model, self.robot.model, one, times * step)
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
-            route = aba_route(state, Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
+            route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
             return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
 
         (dA, dB, *_), worst = self.over([one]), 0.0

@@ -10,7 +10,8 @@ import pinocchio as pin
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.simulation.plots import Curve, curves, resting_from
+from fflin.simulation.plots import resting_from
+from fflin.simulation.report import Curve, curves
 from fflin.view.page import packed
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _lines(
 ) -> dict[tuple[str, str], list[Curve]]:
     """Return the curves at the rows `shown` that are not always zero, by (group, unit)."""
     found: dict[tuple[str, str], list[Curve]] = {}
-    for each in curves(motion, robot.wheels):
+    for each in curves(motion):
         reference = each.reference[shown] if followed and each.reference is not None else None
         curve = each._replace(values=each.values[shown], reference=reference)
         if _size(curve) >= _NOTHING:

@@ -197,7 +197,7 @@ def test_two_outputs_of_one_name_are_refused_before_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link.png").symlink_to("m.png")
     before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr("fflin.commands.simulation.simulated", None)  # the work
+    monkeypatch.setattr(fflin, "simulate", None)  # the work
     code, _, error = run("simulate", urdf, "--plot", "m.png", option, second)
     assert code == 2 and error.count("\n") == 1
     assert "m.png" in error or "link.png" in error

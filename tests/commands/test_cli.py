@@ -15,7 +15,6 @@ import pytest
 import fflin
 from fflin.base.tables import matrix
 from fflin.commands import cli
-from fflin.commands.parser import ROBOT
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run, without_warnings
 from tests.support.messages import says
@@ -409,11 +408,10 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
     from dataclasses import replace
 
     from fflin.commands import cli
-    from fflin.linear import linearization
 
-    right = linearization.linearize
+    right = fflin.linearize
     monkeypatch.setattr(
-        linearization, "linearize", lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001)
+        fflin, "linearize", lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001)
     )
     assert cli.main(["check", "ets_vii"]) == 1
     assert "FAILED" in capsys.readouterr().out
@@ -421,9 +419,8 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
 
 def test_warnings_of_other_packages_are_shown_as_those_of_fflin(monkeypatch, capsys):
     from fflin.commands import cli
-    from fflin.linear import linearization
 
-    right, outcome = linearization.linearize, []
+    right, outcome = fflin.linearize, []
 
     def linearize(*arguments, **options):
         assert (np.array([1e308]) * 10.0).max() == np.inf
@@ -432,7 +429,7 @@ def test_warnings_of_other_packages_are_shown_as_those_of_fflin(monkeypatch, cap
             raise fflin.InputError("too large")
         return right(*arguments, **options)
 
-    monkeypatch.setattr(linearization, "linearize", linearize)
+    monkeypatch.setattr(fflin, "linearize", linearize)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert cli.main(["linearize", "cubesat"]) == 0
@@ -612,8 +609,9 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
 def test_options_that_repeat_a_robot_file_are_in_one_group():
     repeated = {"lock", "orbit", "stiffness", "damping", "gravity", "passive", "inputs", "output"}
     (parsers,) = cli._parser("")._subparsers._group_actions
+    title = "robot (these options override robot.toml)"
     for name in ("linearize", "check", "lqr", "simulate", "sweep", "montecarlo", "funnel"):
-        (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
+        (group,) = (x for x in parsers.choices[name]._action_groups if x.title == title)
         assert {each.dest for each in group._group_actions} == repeated, name
 
 

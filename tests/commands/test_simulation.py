@@ -142,13 +142,11 @@ def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option)
 
 @pytest.fixture
 def interrupted(monkeypatch):
-    from fflin.commands import simulation
-
-    right = simulation.simulated
+    right = fflin.simulate
     monkeypatch.setattr(
-        simulation,
-        "simulated",
-        lambda *a: replace(right(*a), stopped="interrupted at t = 0.5 s"),
+        fflin,
+        "simulate",
+        lambda *a, **k: replace(right(*a, **k), stopped="interrupted at t = 0.5 s"),
     )
 
 

@@ -62,6 +62,7 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         urdf_sha256=robot.urdf_sha256,
         stopped="",
         wheels=tuple(robot.wheels),
+        wheel_inertias=np.array(list(robot.wheels.values())),
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
     )

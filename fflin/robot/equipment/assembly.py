@@ -75,9 +75,7 @@ def equipped(
     the entries of joints that no longer exist.
     """
     before, bare = robot._bare, bare or robot._bare
-    checked = checked_inputs(
-        robot.inputs if inputs is None else inputs, bare.joint, bare.joint_names, robot.passive
-    )
+    checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
     model, joints, followers = bare.model, bare.joints, bare.followers
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
     parts = mounted_wheels(model, bodies, checked)

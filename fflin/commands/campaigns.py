@@ -1,0 +1,210 @@
+"""Commands `montecarlo`, `validity`, `funnel` and `sweep`: many simulations or models."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import fflin
+from fflin.base.errors import FileError, InputError
+from fflin.base.process import Progress
+from fflin.base.tables import folded
+from fflin.commands.points import limits_of_options, load_robot, once, reference_of, state_of
+from fflin.commands.regulator import designed
+from fflin.commands.results import Report
+from fflin.commands.simulation import along, check_pictures, loop_of, pictures
+
+if TYPE_CHECKING:
+    from fflin.base.validation import Array
+    from fflin.batch.configurations import Configurations
+
+_ROWS = 240  # rows of errors and inputs in a figure
+
+
+def montecarlo(arguments: Namespace) -> Report:
+    """Simulate a loop with random parameters; show quantiles, success rates and the worst runs.
+
+    example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
+    """
+    from fflin.campaign.report import campaign_record, worst_runs
+    from fflin.control.policies import bound
+
+    path = arguments.output_file
+    is_table = path is not None and path.suffix in (".csv", ".mat")
+    if is_table and path.exists() and not arguments.force:
+        raise FileError(f"{path} already exists; give another file name, or add --force")
+    dispersions = fflin.load_dispersions(arguments.dispersions)
+    robot = load_robot(arguments)
+    check_pictures(robot, arguments)
+    policy, settings = loop_of(robot, arguments)
+    settings.pop("linear", None)  # the runs are not compared with a linear model
+    for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
+        settings[name] = getattr(arguments, name)
+    with going_on(path, "runs") as progress:
+        campaign = fflin.monte_carlo(
+            robot,
+            policy,
+            dispersions,
+            goals=arguments.goal,
+            histories=_ROWS if arguments.plot else 0,
+            progress=progress,
+            out=None if is_table else path,
+            overwrite=arguments.force,
+            **settings,
+        )
+    worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
+    files = {
+        path: campaign.save if is_table else None,
+        arguments.plot: lambda file: fflin.plot_campaign(campaign, file),
+        **pictures(robot, worst, arguments),
+    }
+    notes = getattr(bound(policy, robot), "notes", ()) if policy else ()
+    shown = [str(campaign), *(folded([note]) for note in notes)]
+    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
+    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    return Report(robot.name, result, text, files)
+
+
+def validity(arguments: Namespace) -> Report:
+    """Find how far the robot can be displaced before the linear model or its regulator fails.
+
+    example: fflin validity ets_vii --attitude 120 --samples 200 --jobs 2
+    """
+    robot, design, lin, gain = designed(arguments)
+    cut = arguments.limits == "urdf"
+    with closing(Progress()) as bar:
+        found = fflin.validity(
+            design,
+            lin.discretize(arguments.sample) if arguments.sample else lin,
+            gain,
+            attitude=arguments.attitude,
+            position=arguments.offset,
+            joint=arguments.spread,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            limits="urdf" if cut else None,
+            workers=arguments.jobs if arguments.jobs > 1 else None,
+            progress=bar,
+        )
+    text = str(found)
+    if cut or any(name in lin.limits for name in lin.input_names):
+        how = "not saturated; use --limits urdf to saturate them"
+        said = "saturated at the limits of the robot" if cut else how
+        text += f"\n{folded([f'inputs were {said}'])}"
+    if design is not robot:
+        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
+    files = {arguments.plot: lambda path: fflin.plot_validity(found, path)}
+    return Report(robot.name, found, text, files)
+
+
+def funnel(arguments: Namespace) -> Report:
+    """Find the initial errors from which the regulator along a trajectory reaches a goal.
+
+    example: fflin funnel arm.toml --schedule gains.npz --goal attitude=1
+    """
+    if arguments.trajectory is None and arguments.schedule is None:
+        raise InputError("neither --trajectory nor --schedule is given; give one of them")
+    robot = load_robot(arguments)
+    policy = along(robot, arguments)
+    with closing(Progress()) as bar:
+        found = fflin.funnel(
+            robot,
+            policy,
+            once("--goal", arguments.goal),
+            within=once("--within", arguments.within),
+            limits=limits_of_options(arguments),
+            dt=arguments.dt,
+            knots=arguments.knots,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            confidence=arguments.confidence,
+            threads=arguments.threads,
+            progress=bar,
+        )
+    files = {
+        arguments.plot: lambda path: fflin.plot_funnel(found, path),
+        arguments.output_file: found.save,
+    }
+    return Report(robot.name, found, str(found), files)
+
+
+def sweep(arguments: Namespace) -> Report:
+    """Linearise about many points and save all models.
+
+    example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
+    """
+    from fflin.batch.files import part_of
+    from fflin.batch.sweep import planned_bytes
+
+    path, robot = arguments.output_file, load_robot(arguments)
+    settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
+    q, v, u = _points(robot, arguments)
+    size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
+    part = part_of(path)
+    resuming = f", resuming from {part}" * part.exists()
+    needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
+    said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
+    print(f"fflin: {said}", file=sys.stderr)  # all options are valid
+    with going_on(path, "points") as progress:
+        work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
+        batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
+    states, inputs = len(batch.state_names), len(batch.input_names)
+    text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
+    names = ("state_names", "state_units", "input_names", "input_units", "frame")
+    result = {"points": len(batch), **{name: getattr(batch, name) for name in names}}
+    return Report(robot.name, result, text, {path: None})
+
+
+def _points(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[Configurations, Array | None, Array | None]:
+    """Return q, v and u of the points of a sweep."""
+    import numpy as np
+    import pinocchio as pin
+
+    from fflin.robot.joints import by_joint
+
+    if bool(arguments.grid) == (arguments.random is not None):
+        raise InputError("a sweep needs exactly one of --grid and --random; give one of them")
+    if arguments.range and arguments.random is None:
+        raise InputError("--range needs --random; --grid has its own ranges")
+    q, v = state_of(robot, arguments, robot.point)
+    u = fflin.effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    fixed = once("--joint", arguments.joint)
+    base = robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
+    if arguments.random is not None:
+        ranges = once("--range", arguments.range)
+        ranges |= {name: (value, value) for name, value in fixed.items()}
+        drawn = {"seed": arguments.seed, "ranges": ranges, "base": base}
+        return fflin.random_configurations(robot, arguments.random, **drawn), v, u
+    axes = once("--grid", arguments.grid)
+    for name in axes:
+        robot.joint(name)
+    values = {name: np.linspace(*axis) for name, axis in axes.items()}
+    joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
+    others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
+    return fflin.grid(robot, values, joints=others, base=base), v, u
+
+
+@contextmanager
+def going_on(path: Path | None, what: str) -> Iterator[Progress]:
+    """Show a progress bar; after Ctrl-C, report the progress and the file that can be resumed."""
+    from fflin.batch.files import part_of
+
+    bar = Progress()
+    try:
+        yield bar
+    except KeyboardInterrupt:
+        said = f"stopped at {bar.done:,} of {bar.total:,} {what}" if bar.total else "stopped"
+        if not path:
+            said += "; nothing is saved without -o FILE"
+        elif part_of(path).exists():
+            said += f"; the same command resumes from {part_of(path)}"
+        raise KeyboardInterrupt(said) from None
+    finally:
+        bar.close()
