@@ -24,7 +24,7 @@ from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.check import aba_route
-from fflin.linear.linearization import Prepared, own_reference, prepare
+from fflin.linear.linearization import Prepared, own_reference
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, output_equations
 from fflin.robot.joints import ROOT
@@ -49,7 +49,7 @@ class ModelDerivatives:
         own = own and robot.orbit is None
         self._how: Any = {"frame": lin.frame, "moving": lin.moving}
         self._how["reference"] = None if own else lin.reference
-        ready = self._ready = prepare(robot, **self._how)
+        ready = self._ready = Prepared(robot, **self._how)
         state, data = ready.map, robot.create_data()
         self._chart = Standing() if own else state.chart(lin.q)
         self._u = ready.actuation.in_base_axes(self._chart, lin.u0)
@@ -116,7 +116,7 @@ class ModelDerivatives:
         if not rows:
             return found
         other = replace(self.robot, model=self.robot.model.copy())
-        ready = prepare(other, **self._how)
+        ready = Prepared(other, **self._how)
         sensing, actuation = ready.sensing, ready.actuation
         assert sensing is not None
         data, point = other.create_data(), (lin.q, lin.v, ready.map.velocities(lin.v), self._u)

@@ -13,7 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
-from fflin.linear.linearization import linearize, prepare
+from fflin.linear.linearization import Prepared, linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.mass_properties import Piece
 from fflin.robot.robot import Robot
@@ -355,7 +355,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
 
 
 def _lft(of: Uncertain, lin: LinearModel) -> LFT:
-    ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
+    ready = Prepared(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
         feels = "an output depends on accelerations or masses, which the LFT cannot represent"
         raise InputError(f"{feels}; remove it with robot.replace(outputs=)")
