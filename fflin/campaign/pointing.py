@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Loads, Tree
 from fflin.robot.equipment.mounting import turned_to
-from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.inputs import Input, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
@@ -27,17 +26,6 @@ def turned(direction: object, angles: Array) -> Array:
     side = angles[:, 1:] * first - angles[:, :1] * second
     found: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
     return found
-
-
-def require_direction(robot: Robot, at: int) -> None:
-    """Raise `InputError` if an input cannot be misaligned."""
-    for item, names, first in _indexed(robot):
-        if first <= at < first + len(names) and isinstance(item, JointTorque):
-            raise InputError(
-                f"'{names[0]}.misalignment' is dispersed, but the motor of a joint cannot be "
-                "misaligned with the joint; only thrusters, wheels, tau_b and F_b can be "
-                "misaligned"
-            )
 
 
 def columns_of(robot: Robot, angles: Array) -> Array:

@@ -37,7 +37,7 @@ from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
-from fflin.simulation.run import Recording, go
+from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of
 
 _LARGEST_CHUNK = 256
@@ -233,7 +233,7 @@ def _loop_arrays(plan: Plan) -> dict[str, object]:
 
     Two plans with equal arrays have equal runs.
     """
-    parts = packed(plan)
+    parts = packed(plan, stop_conditions(plan))
     last = min(plan.times.steps, SLOTS * plan.times.sample)
     samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
     found: dict[str, object] = {"noise": samples}

@@ -156,8 +156,11 @@ def _distribution(distribution: str, **given: object) -> object:
     )
 
 
-def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
-    """Return the inverse distribution function of a spread."""
+def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Callable[[Array], Array]:
+    """Return the inverse distribution function of a spread; a number is the value if `fixed`.
+
+    The functions of this module are partial functions; others may be slow.
+    """
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
@@ -184,12 +187,7 @@ def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:
         raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of at least 0")
-    return partial(_normal, deviation)
-
-
-def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Return whether this module defines an inverse function; other functions may be slow."""
-    return isinstance(inverse, partial) or inverse is whole_number
+    return partial(_choice, np.array([deviation])) if fixed else partial(_normal, deviation)
 
 
 def _uniform(least: float, largest: float, u: Array) -> Array:
@@ -207,13 +205,9 @@ def _normal(deviation: float, u: Array) -> Array:
     return normal
 
 
-def whole_number(u: Array) -> Array:
-    """Return seeds of noise: whole numbers below 2^53, which doubles represent exactly."""
-    return np.floor(u * 2.0**53)
+def _whole(end: float, u: Array) -> Array:
+    return np.floor(end * u)
 
 
-def deviation_of(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse function for the deviation of noise; a number is the deviation itself."""
-    inverse = inverse_of(name, spread)
-    fixed = getattr(inverse, "func", None) is _normal
-    return partial(_choice, np.array([float(spread)])) if fixed else inverse
+# Seeds of noise: whole numbers below 2^53, which doubles represent exactly.
+SEEDS = partial(_whole, 2.0**53)

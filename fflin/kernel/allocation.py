@@ -68,14 +68,8 @@ class Allocation(namedtuple("Allocation", "asking giving point work problem")):
 
 
 LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
-ALLOCATION = Struct(
-    Allocation,
-    asking=MECHANICS,
-    giving=MECHANICS,
-    point=POINT,
-    work=LANED,
-    problem=LEAST_SQUARES,
-)
+_ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
+ALLOCATION = Struct(Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES)
 
 
 def least_squares(least, most, size):

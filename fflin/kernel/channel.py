@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, WHOLE, Struct
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
 
 
@@ -44,20 +44,9 @@ class Channel(
 
 
 WHEELS = Struct(Wheels, at=INDICES, row=INDICES)
-PULSES = Struct(
-    Pulses,
-    at=INDICES,
-    on_off=FLAGS,
-    time=REAL,
-    **dict.fromkeys(("left", "level", "end"), LANED),
-)
-CHANNEL = Struct(
-    Channel,
-    wheels=WHEELS,
-    pulses=PULSES,
-    **dict.fromkeys(("slots", "sample"), WHOLE),
-    **dict.fromkeys(("held", "pending", "delay", "fresh"), LANED),
-)
+PULSES = Struct(Pulses, REALS, {LANED: "left level end"}, at=INDICES, on_off=FLAGS, time=REAL)
+_OF_CHANNEL = {WHOLE: "slots sample", LANED: "held pending delay fresh"}
+CHANNEL = Struct(Channel, REALS, _OF_CHANNEL, wheels=WHEELS, pulses=PULSES)
 
 
 @inlined

@@ -13,6 +13,7 @@ about the initial position of the base's origin. Positions are relative to this 
 from __future__ import annotations
 
 from collections import namedtuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,32 +62,29 @@ class Point(namedtuple("Point", "q nu u pushing wrench")):
     """
 
 
-_OF_BODIES = dict.fromkeys(("parent", "index", "coordinate", "target", "row", "depth", "path"))
-_SIZES = "entries places own inertias packed scaled diagonal square size"
-TREE = Struct(
-    Tree,
-    **dict.fromkeys(_OF_BODIES, INDICES),
-    **dict.fromkeys(_SIZES.split(), WHOLE),
-    **dict.fromkeys(("fixed", "bodies"), LANED),
-    unbounded=FLAGS,
-    axes=Kind(np.float64, 3),
-    common=Kind(np.intp, 2),
-)
+class CommonPoint(Point):
+    """Point that is common to all lanes."""
+
+
+_OF_TREE = {
+    INDICES: "parent index coordinate target row depth path",
+    WHOLE: "entries places own inertias packed scaled diagonal square size",
+    LANED: "fixed bodies",
+}
+_AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
+TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
 LAYOUT = Struct(Layout, WHOLE)
 LOADS = Struct(Loads, LANED, body=INDICES, input=INDICES, stored_body=INDICES)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
-# A point that is common to all lanes.
-COMMON_POINT = Struct(Point, REALS, "CommonPoint")
-MECHANICS = Struct(
-    Mechanics,
-    INDICES,
-    tree=TREE,
-    layout=LAYOUT,
-    loads=LOADS,
-    faults=ACTUATOR_FAULTS,
-    **dict.fromkeys(("circling", "springy"), FLAGS),
-    **dict.fromkeys(("gravity", "scale", "rest", "origin"), REALS),
-)
+COMMON_POINT = Struct(CommonPoint)
+_OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
+_PARTS: dict[str, Struct[NamedTuple]] = {
+    "tree": TREE,
+    "layout": LAYOUT,
+    "loads": LOADS,
+    "faults": ACTUATOR_FAULTS,
+}
+MECHANICS = Struct(Mechanics, INDICES, _OF_MECHANICS, **_PARTS)
 
 
 @called

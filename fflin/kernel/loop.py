@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
-from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Opener, Struct
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, REALS, Opener, Struct
 from fflin.kernel.channel import CHANNEL, is_asked, transmit
 from fflin.kernel.forward import (
     MECHANICS,
@@ -209,16 +209,18 @@ class RunStatistics(
     """
 
 
-_IN_LANES = "sizes largest_x largest_u largest outside errors inputs states"
 RUN_STATISTICS = Struct(
     RunStatistics,
+    REALS,
+    {
+        INDICES: "kind steps",
+        LANED: "sizes largest_x largest_u largest outside errors inputs states",
+    },
     robot=MECHANICS,
     law=LAW,
     path=PATH,
     settled=REAL,
     at=POINT,
-    **dict.fromkeys(("kind", "steps"), INDICES),
-    **dict.fromkeys(_IN_LANES.split(), LANED),
 )
 _opened_statistics = Opener(RUN_STATISTICS)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
-from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, WHOLE, Struct
+from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.lanes import (
     angle,
@@ -51,15 +51,8 @@ class Path(
     """
 
 
-PATH = Struct(
-    Path,
-    **dict.fromkeys(("hold", "ends"), FLAG),
-    **dict.fromkeys(("ahead", "over", "last"), REAL),
-    held=INDICES,
-    order=WHOLE,
-    e=LANED,
-    point=COMMON_POINT,
-)
+_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
+PATH = Struct(Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT)
 
 
 @inlined
@@ -216,18 +209,16 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-GRID = Struct(Grid, at=LANED, **dict.fromkeys(("joint", "first", "stride"), INDICES))
-GYROS = Struct(Gyros, body=INDICES)
-FILTER = Struct(Filter, z=LANED, rates=LANED)
 LAW = Struct(
     Law,
+    REALS,
+    {LANED: "x y added u"},
     kind=WHOLE,
     turned=FLAGS,
-    grid=GRID,
-    filter=FILTER,
+    grid=Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED),
+    filter=Struct(Filter, z=LANED, rates=LANED),
     measured=INDICES,
-    gyros=GYROS,
-    **dict.fromkeys(("x", "y", "added", "u"), LANED),
+    gyros=Struct(Gyros, body=INDICES),
     path=PATH,
     allocation=ALLOCATION,
 )

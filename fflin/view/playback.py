@@ -18,7 +18,7 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, find_frame, find_joint, frame_index
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
-from fflin.simulation.plant import Plant
+from fflin.simulation.run import Plant
 from fflin.view.shapes import bendings
 
 # Limits of one integration step of a payload's flight before capture: time [s], and phase [rad] of
