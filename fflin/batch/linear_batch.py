@@ -307,9 +307,11 @@ class LinearBatch(FrozenArrays):
                 f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
                 "its URDF, joints or orbit; give the robot for which the batch was made"
             )
-        from fflin.linear.linearization import prepare
+        from fflin.linear.linearization import Prepared
 
-        common = prepare(robot, frame=found["frame"], reference=None, moving=found["moving"]).common
+        common = Prepared(
+            robot, frame=found["frame"], reference=None, moving=found["moving"]
+        ).common
         return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
