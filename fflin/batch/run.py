@@ -322,14 +322,14 @@ class OwnWorkers(Executor):
 
     def _start(self) -> ProcessPoolExecutor:
         """Start a process for this thread and wait until it is ready."""
-        # With fork, a process would inherit locks that other threads hold, and could wait for them
-        # forever.
-        pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare)
         with self._lock:
             if self._closed:
                 raise NoWorkers("the workers have been shut down")
             try:
                 with _starting():
+                    # With fork, a process would inherit locks that other threads hold, and could
+                    # wait for them forever.
+                    pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare)
                     ready = pool.submit(int)
             except OSError as error:
                 raise NoWorkers(f"no worker process can be started: {error}") from None
