@@ -290,6 +290,13 @@ class Design(FrozenArrays):
         write_record(as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
+    def of(cls: type[Kind], source: object, **own: object) -> Kind:
+        """Return a result with the fields `own`; all other fields are attributes of `source`."""
+        names = [item.name for item in fields(cls) if item.name not in own]
+        values: dict[str, Any] = own | {name: getattr(source, name) for name in names}
+        return cls(**values)
+
+    @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
         """Read a file that `save` wrote; every value is restored bit for bit.
 

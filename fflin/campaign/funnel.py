@@ -32,8 +32,8 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
-from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of
 from fflin.dynamics.state import StateMap
