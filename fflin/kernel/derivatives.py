@@ -29,9 +29,8 @@ from collections import namedtuple
 import numpy as np
 
 from fflin.base.validation import Array, Mask
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.rnea import Inertia
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis

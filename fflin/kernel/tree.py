@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 

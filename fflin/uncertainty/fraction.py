@@ -21,8 +21,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.mass_properties import Piece
 from fflin.uncertainty.derivatives import UNITS
 from fflin.uncertainty.parameters import AXES, ENTRIES, OF_PIECES, Parameter
