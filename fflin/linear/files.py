@@ -268,14 +268,15 @@ def arguments(
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u
-    names, there = actuation.names, texts(entries.get("input_names", actuation.names))
-    if names != there or u.shape[-1] != len(names):
-        extra = [name for name in there if name not in names]
-        raise InputError(
-            f"the file has {u.shape[-1]} inputs{f', such as {extra[0]}' if extra else ''}, "
-            f"expected one for each input of the robot: {listed(names)}; load the robot with the "
-            "inputs of the trajectory (--inputs)"
-        )
+    names, given = actuation.names, texts(entries.get("input_names", ()))
+    if given != names and (given or u.shape[-1] != len(names)):
+        missing, extra = ([n for n in x if n not in y] for x, y in ((names, given), (given, names)))
+        parts = [f"lacks the inputs {listed(missing)}"] * bool(missing)
+        parts += [f"has the other inputs {listed(extra)}"] * bool(extra)
+        said = f"the file {' and '.join(parts) or 'has the inputs of the robot in another order'}"
+        if not given:
+            said = f"u has {u.shape[-1]} columns, expected one for each input: {listed(names)}"
+        raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
     for columns in actuation.held:
         # Inputs in reference axes are rotated to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
