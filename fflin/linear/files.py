@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.errors import FflinError, FileError, InputError, listed, require_known
+from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, vector
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
@@ -245,13 +245,11 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         entries, verified = _columns(source) if table else read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
-    try:
+    with located(str(source)):
         entries = _entries(entries, robot) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
         frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
         return arguments(entries, robot, hold, frame, verified)
-    except FflinError as error:
-        raise type(error)(f"{source}: {error}") from None
 
 
 def arguments(
@@ -268,15 +266,16 @@ def arguments(
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u
-    names, given = actuation.names, texts(entries.get("input_names", ()))
-    if given != names and (given or u.shape[-1] != len(names)):
-        missing, extra = ([n for n in x if n not in y] for x, y in ((names, given), (given, names)))
-        parts = [f"lacks the inputs {listed(missing)}"] * bool(missing)
-        parts += [f"has the other inputs {listed(extra)}"] * bool(extra)
-        said = f"the file {' and '.join(parts) or 'has the inputs of the robot in another order'}"
-        if not given:
-            said = f"u has {u.shape[-1]} columns, expected one for each input: {listed(names)}"
-        raise InputError(f"{said}; load the robot with the inputs of the trajectory (--inputs)")
+    names, there = actuation.names, texts(entries.get("input_names", actuation.names))
+    if names != there or u.shape[-1] != len(names):
+        lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
+        said = f"; it lacks the inputs {listed(lacking)}" if lacking else ""
+        said += f"; it has the other inputs {listed(other)}" if other else ""
+        raise InputError(
+            f"the file has {u.shape[-1]} inputs, expected one for each input of the robot, in the "
+            f"order {listed(names)}{said}; load the robot with the inputs of the trajectory "
+            "(--inputs)"
+        )
     for columns in actuation.held:
         # Inputs in reference axes are rotated to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
