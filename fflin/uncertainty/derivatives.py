@@ -23,7 +23,7 @@ from fflin.dynamics.orbital import GravityGradient, field_of
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.check import aba_route
-from fflin.linear.linearization import own_reference, prepare
+from fflin.linear.linearization import Prepared, own_reference
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, output_equations
 from fflin.robot.joints import ROOT
@@ -68,7 +68,7 @@ class ModelDerivatives:
         own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin)))
         own = own and robot.orbit is None
         reference = None if own else lin.reference
-        self._prepare = partial(prepare, frame=lin.frame, reference=reference, moving=lin.moving)
+        self._prepare = partial(Prepared, frame=lin.frame, reference=reference, moving=lin.moving)
         self._ready = self._prepare(robot)
         state, actuation, data = self._ready.map, self._ready.actuation, robot.create_data()
         self._state, self._data = state, robot.create_data()

@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
-from fflin.linear.linearization import linearize, prepare
+from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
 from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
@@ -92,7 +92,7 @@ class Uncertain:
                 "makes the point an equilibrium only for some values of the parameters; remove "
                 "this effect from the robot, or linearise each robot of samples(n)"
             )
-        ready = prepare(robot, frame=lin.frame, reference=None, moving=False)
+        ready = Prepared(robot, frame=lin.frame, reference=None, moving=False)
         return linear_fractional(lin, ready, self._parameters.pieces, self.blocks)
 
     def at(self, values: Mapping[str, float]) -> Robot:
