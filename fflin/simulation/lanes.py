@@ -94,17 +94,15 @@ class LaneLoop:
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
-        if runs and "delay" in runs:  # provide space for the largest delay
+        runs = runs or {}
+        if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
-        parts, stop = packed(plan), stop_conditions(plan)
-        law = parts.law
-        if runs and "seed" in runs and len(law.added) == len(law.y):
-            law = law._replace(added=np.zeros(SLOTS * len(law.y)))
+        stop = stop_conditions(plan)
         if runs:  # all runs are given with a quaternion for which the sign is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
-        parts = parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign))
+        parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
-        self._ending, self._noisy = ending_of(plan, stop), len(law.added) > len(law.y)
+        self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
         # Laned arrays, each with the column of its initial values.
         self._fresh: list[tuple[Array, Array]] = []
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))

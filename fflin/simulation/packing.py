@@ -21,16 +21,18 @@ from fflin.kernel.tree import batch_tree
 from fflin.robot.fields import limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant
-from fflin.simulation.run import Conserved, stop_conditions
+from fflin.simulation.run import Plant
 
 SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
 
 
-def packed(plan: Plan) -> loop.Arguments:
-    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports."""
+def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
+    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
+
+    `stop` has rates in the order of v. The law has room for noise if it is `noisy`.
+    """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
-    h, state, kept, stop = times.dt, plant.state, Conserved(plan), stop_conditions(plan)
+    h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     mechanics = mechanics_of(plant)
     # Commands that would act only after the end of the run need no space in the delay line.
@@ -46,14 +48,10 @@ def packed(plan: Plan) -> loop.Arguments:
             weights=np.array(method.weights) * h,
             moments=h * (np.array(method.moments) * h),
         ),
-        law=_law(plan, mechanics),
+        law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
-        reference=forward.MomentumReference(
-            start=np.concatenate((kept.momentum, kept.center(0.0), plan.q[:3])),
-            weight=kept.mass * np.array(state.robot.gravity),
-            per_mass=[1.0 / kept.mass],
-            sums=np.zeros(forward.SUMS),
-        ),
+        # The loop writes these at its start.
+        reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
         stop=stop._replace(squares=state.velocities(stop.squares)),
@@ -112,7 +110,7 @@ def noise_of(plan: Plan) -> Callable[[float], ArrayLike] | None:
     return noise
 
 
-def _law(plan: Plan, mechanics: forward.Mechanics) -> policies.Law:
+def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy; with an allocation, of the robot `asking`."""
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
@@ -134,7 +132,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics) -> policies.Law:
         else:
             law = law._replace(grid=_grid(policy, state.robot.joint_names))
         law = law._replace(near=x0[state.groups.q_m].copy())
-    size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
+    size, slots = len(law.measured), SLOTS if noisy or noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 

@@ -29,7 +29,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
-from fflin.simulation.plant import Disturbance, Plant
+from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -40,7 +40,6 @@ Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
 # Bounds of an automatic duration [s], and the time step [s] of the linear loop that determines it.
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
-LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _STEP = 0.01  # [s]
 # If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
 _BEFORE = 1e-6

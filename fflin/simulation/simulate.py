@@ -19,8 +19,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import carried_out, engine_of
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
-from fflin.simulation.plant import Disturbance
-from fflin.simulation.run import Conserved, Recording
+from fflin.simulation.run import Conserved, Disturbance, Recording
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

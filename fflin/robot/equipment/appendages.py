@@ -194,17 +194,10 @@ class FlexibleAppendage(_Part):
         """
         from fflin.robot.equipment.nastran import read_superelement
 
-        found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
-        return cls(
-            frame,
-            found.frequency,
-            found.L[:3],
-            found.L[3:],
-            damping,
-            name,
-            inertia=found.inertia,
-            rigid=rigid,
+        frequency, L, inertia = read_superelement(
+            op4, asm, origin=origin, modes=modes, length=length, mass=mass
         )
+        return cls(frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid)
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -468,9 +461,9 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(entries)
 
 
-def _text(what: str, value: Any) -> str:
+def _text(what: str, value: object) -> str:
     printable = isinstance(value, str) and value.strip() and value.isprintable()
-    if not printable or (what == "name" and set(value) & set("*?[]")):
+    if not printable or (what == "name" and set(str(value)) & set("*?[]")):
         raise InputError(
             f"{what} of an appendage is {value!r}, expected a name, without *, ?, [ and ]"
         )
