@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fflin.base.errors import MissingPackageError
+from fflin.base.errors import MissingPackageError, optional_package
 from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
@@ -76,11 +76,7 @@ def drawing(
 def require_matplotlib() -> None:
     """Raise `MissingPackageError` if matplotlib is not installed or cannot be loaded."""
     try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise MissingPackageError(
-            "figures need matplotlib; install it with: pip install 'fflin[plot]'"
-        ) from None
+        optional_package("matplotlib", "figures need matplotlib", "plot")
     except ValueError as error:  # invalid MPLBACKEND or settings file
         said = str(error).partition(";")[0]
         raise MissingPackageError(

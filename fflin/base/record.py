@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -309,12 +309,7 @@ class Design(FrozenArrays):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
-            values = {
-                item.name: _value(cls, item, record[item.name])
-                for item in _saved(cls)
-                # Files saved by older versions may lack fields that have a default.
-                if item.name in record or item.default_factory is MISSING
-            }
+            values = {item.name: _value(cls, item, record[item.name]) for item in _saved(cls)}
             return cls(**given, **values, verified=verified)
 
 
@@ -323,8 +318,7 @@ def record_of(design: Design) -> Record:
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)
-        if item.name in design.OPEN:
-            value = np.nan_to_num(value, nan=np.nan)
+        value = np.nan_to_num(value, nan=np.nan) if item.name in design.OPEN else value
         record[item.name] = list(value) if isinstance(value, tuple) else value
     return record
 

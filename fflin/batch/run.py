@@ -25,12 +25,13 @@ from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from threading import Lock, Thread, local
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, Mask, whole
+from fflin.base.validation import Array, Mask, instance, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
 
@@ -90,11 +91,7 @@ class Execution:
     ) -> None:
         if executor is not None and workers is not None:
             raise InputError("executor and workers are both given; give only one of them")
-        if executor is not None and not hasattr(executor, "submit"):
-            raise InputError(
-                f"executor has type {type(executor).__name__}, expected a "
-                "concurrent.futures.Executor"
-            )
+        instance("executor", executor, (Executor, NoneType), "a concurrent.futures.Executor")
         for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
             if value is not None:
                 whole(name, value, 1)

@@ -369,7 +369,7 @@ class SweepTask:
         if v is not None:
             self._known["v"] = checked_velocities(self.robot, v, self.count)
         if u is not None:
-            self._known["u0"] = checked_inputs(prepared.actuation.names, u, self.count)
+            self._known["u0"] = checked_inputs(len(prepared.actuation.names), u, self.count)
         # The known arrays that vary between points, and the shapes per point of all that do.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
         if isinstance(configurations, GivenConfigurations):

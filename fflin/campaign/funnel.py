@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -139,25 +139,23 @@ class Funnel(Design):
     frame: str
 
     @cached_property
-    def _counts(self) -> tuple[Array, Array, Array]:
-        counts = [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
-        inside, bounds, intervals = map(np.array, zip(*counts, strict=True))
-        return inside, bounds, intervals
+    def _counts(self) -> list[tuple[int, float, tuple[float, float]]]:
+        return [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
 
     @property
     def inside(self) -> Array:
         """Number of runs (m,) that start at or below the level `rho`."""
-        return self._counts[0]
+        return np.array([inside for inside, _, _ in self._counts])
 
     @property
     def inside_rate(self) -> Array:
         """Lower bound (m,) on the success rate of runs that start at or below the level `rho`."""
-        return self._counts[1]
+        return np.array([bound for _, bound, _ in self._counts])
 
     @property
     def rate(self) -> Array:
         """Clopper-Pearson interval (m, 2) of the success rate of all runs."""
-        return self._counts[2]
+        return np.array([interval for _, _, interval in self._counts])
 
     @cached_property
     def rho(self) -> Array:
@@ -377,15 +375,7 @@ def funnel(
     with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            axes = ellipsoid_axes(by.P[first])
-            drawn = partial(_starts, job.x0, by.P[first], axes, rng)
-
-            def simulate(roots: Array, job: CampaignJob = job, drawn: Any = drawn) -> Array:
-                return completed(job, drawn(roots), how)["outcome"]
-
-            root = _largest_root(simulate, _widest(axes, robot))
-            tried[knot] = root**2
-            outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
+            tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
             if progress:
                 progress(knot + 1, len(jobs))
     return Funnel(
@@ -424,15 +414,40 @@ def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
     return beyond
 
 
-def _starts(center: Array, P: Array, axes: Array, rng: np.random.Generator, roots: Array) -> Array:
-    """Return random initial deviations e (N, nx) from `center` with sqrt(e' P e) equal to `roots`.
+def _tested(
+    job: CampaignJob, P: Array, samples: int, rng: np.random.Generator, how: Execution
+) -> tuple[float, Array]:
+    """Return the largest level tested at a knot, and the outcomes (samples,) up to this level.
 
-    P (nx, nx) is the matrix of the level, and `axes` are its `ellipsoid_axes`.
+    About one run in 16 fails at the largest level. P (nx, nx) is the matrix of the level.
     """
-    e = rng.normal(size=(len(roots), len(P))) @ axes.T
-    # Directions in which P is zero do not contribute to the level.
-    e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
-    return moved_by("local", np.tile(center, (len(e), 1)), e) - center
+    W, joints = ellipsoid_axes(P), job.plant.robot.joints
+
+    def simulate(roots: Array) -> Array:
+        """Return the outcomes of runs from random errors e (N, nx) with sqrt(e' P e) = roots."""
+        e = rng.normal(size=(len(roots), len(P))) @ W.T
+        # Directions in which P is zero do not contribute to the level.
+        e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
+        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
+        return completed(job, starts - job.x0, how)["outcome"]
+
+    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
+    reach = [
+        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
+        np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
+        *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
+    ]
+    # `root` is the square root of a level; at `widest`, a start has one of the largest errors.
+    root = widest = float(1.0 / max(reach))
+    # If the goal is missed even without an error, the widest level is tested.
+    if not simulate(np.zeros(1)).any():
+        for _ in range(_HALVINGS):
+            if not simulate(np.full(_PILOTS, root)).any():
+                break
+            root /= 2.0
+        further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
+        root = min(root * (2.0 if further else 1.4), widest)
+    return root**2, simulate(root * (np.arange(samples) + 0.5) / samples)
 
 
 def runs_from(
@@ -455,19 +470,6 @@ def runs_from(
     # entries at the start and at the end.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
-
-
-def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the square root of the largest level to test; about one run in 16 fails there."""
-    root = widest
-    if simulate(np.zeros(1)).any():
-        return root  # the goal is missed even without an error
-    for _ in range(_HALVINGS):
-        if not simulate(np.full(_PILOTS, root)).any():
-            break
-        root /= 2.0
-    further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
-    return min(root * (2.0 if further else 1.4), widest)
 
 
 def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
@@ -506,14 +508,3 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
     if not len(chosen):
         raise InputError("knots is empty; give the number of knots, or a list of times [s]")
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]
-
-
-def _widest(W: Array, robot: Robot) -> float:
-    """Return the square root of the largest level that keeps a start within its largest errors."""
-    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
-    reach = [
-        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
-        np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
-        *np.linalg.norm(W[6 : 6 + robot.n], axis=1) / np.array(largest),
-    ]
-    return float(1.0 / max(reach))

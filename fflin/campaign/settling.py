@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.names import rate_of
+from fflin.analysis.mechanics import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product

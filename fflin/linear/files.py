@@ -270,11 +270,13 @@ def arguments(
     u = u[:, None] if u.ndim == 1 else u
     names, there = actuation.names, texts(entries.get("input_names", actuation.names))
     if names != there or u.shape[-1] != len(names):
-        extra = [name for name in there if name not in names]
+        lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
+        said = f"; it lacks the inputs {listed(lacking)}" if lacking else ""
+        said += f"; it has the other inputs {listed(other)}" if other else ""
         raise InputError(
-            f"the file has {u.shape[-1]} inputs{f', such as {extra[0]}' if extra else ''}, "
-            f"expected one for each input of the robot: {listed(names)}; load the robot with the "
-            "inputs of the trajectory (--inputs)"
+            f"the file has {u.shape[-1]} inputs, expected one for each input of the robot, in the "
+            f"order {listed(names)}{said}; load the robot with the inputs of the trajectory "
+            "(--inputs)"
         )
     for columns in actuation.held:
         # Inputs in reference axes are rotated to world axes.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.analysis.modes import energy_by_body
+from fflin.analysis.modes import energies_of
 from fflin.base.errors import InputError
 from fflin.base.tables import counted
 from fflin.base.validation import Array
@@ -64,7 +64,7 @@ def mode_page(
         robot, drawing, at_rest, scene=scene, subtitle=about, tool=tool, frame=lin.frame
     )
     swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
-    energies = energy_by_body(robot, lin, [mode.shape for mode in found.vibrations])
+    energies = energies_of(robot, lin, [mode.shape for mode in found.vibrations])
     points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
     info |= {
         "mode": "modes",
@@ -80,7 +80,7 @@ def mode_page(
                 "shape": _shape(mode, lin),
                 "poses": packed(poses),
             }
-            for mode, energy, poses in zip(found.vibrations, energies, swings, strict=True)
+            for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
         ],
     }
     return build_page(info, window.commands()), drawing.notes

@@ -194,17 +194,10 @@ class FlexibleAppendage(_Part):
         """
         from fflin.robot.equipment.nastran import read_superelement
 
-        found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
-        return cls(
-            frame,
-            found.frequency,
-            found.L[:3],
-            found.L[3:],
-            damping,
-            name,
-            inertia=found.inertia,
-            rigid=rigid,
+        frequency, L, inertia = read_superelement(
+            op4, asm, origin=origin, modes=modes, length=length, mass=mass
         )
+        return cls(frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid)
 
     @property
     def modes(self) -> tuple[str, ...]:
