@@ -14,7 +14,6 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.coordinates import moving_errors
 from fflin.simulation.report import Curve, curves
 
 if TYPE_CHECKING:
@@ -138,9 +137,8 @@ def _title(motion: Motion) -> str:
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """Return the errors from a reference (attitude in degrees), or else from the linear model."""
     names, units, what = motion.state_names, motion.state_units, "error"
-    if motion.tracked:
+    if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
-        e = moving_errors(motion.frame, motion.x, motion.target)
         sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
         e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
     elif motion.linear is not None:
