@@ -108,11 +108,10 @@ def text(value: object) -> str:
     return value if isinstance(value, str) else str(np.asarray(value).item())
 
 
-def texts(value: Any) -> tuple[str, ...]:
+def texts(value: object) -> tuple[str, ...]:
     """Return a list of strings from a record; a single string becomes a list of one."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return (value,) if isinstance(value, str) else tuple(map(text, value))
+    items = value.tolist() if isinstance(value, np.ndarray) else value
+    return tuple(map(text, items)) if isinstance(items, list | tuple) else (text(items),)
 
 
 def figure(value: object) -> float:
@@ -126,7 +125,7 @@ def figures(value: object) -> dict[str, float]:
     return {key: figure(x) for key, x in group.items()}
 
 
-def content_digest(entries: Mapping[str, Any]) -> str:
+def content_digest(entries: Mapping[str, object]) -> str:
     """Return the SHA-256 of arrays or bytes with their names, types and shapes.
 
     All file formats with several parts use this digest. The bytes of a part are hashed in blocks of
@@ -135,8 +134,8 @@ def content_digest(entries: Mapping[str, Any]) -> str:
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for key, value in sorted(entries.items()):
-            binary = isinstance(value, bytes)
-            array = np.frombuffer(value, np.uint8) if binary else np.asarray(value)
+            raw = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
+            array = np.asarray(raw)
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
@@ -207,7 +206,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
-def _of_mat(value: object) -> Any:
+def _of_mat(value: object) -> object:
     """Convert a MATLAB variable: text to str, cells or text rows to a list, a struct to a dict."""
     if not isinstance(value, np.ndarray):
         return value
@@ -220,7 +219,7 @@ def _of_mat(value: object) -> Any:
 
 
 def _to_json(record: Mapping[str, object], checksummed: bool) -> bytes:
-    def plain(value: object) -> Any:
+    def plain(value: object) -> object:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
         return value.tolist() if isinstance(value, np.ndarray) else value
@@ -289,6 +288,12 @@ class Design(FrozenArrays):
             If a value is not finite.
         """
         write_record(as_path(path), record_of(self), checksummed=self.verified)
+
+    @classmethod
+    def _of(cls: type[Kind], source: object, **own: Any) -> Kind:
+        """Return a result with `own` fields; other fields are the attributes of `source`."""
+        names = (each.name for each in fields(cls) if each.init and each.name not in own)
+        return cls(**{key: getattr(source, key) for key in names if hasattr(source, key)}, **own)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar
 
 import numpy as np
 
@@ -62,15 +62,15 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
     return array
 
 
-def number(name: str, value: Any) -> float:
+def number(name: str, value: object) -> float:
     """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
-    if isinstance(value, bool | np.bool_ | str):
+    result: float | None = None
+    if isinstance(value, SupportsFloat) and not isinstance(value, bool | np.bool_):
+        with suppress(TypeError, ValueError, OverflowError):
+            result = float(value)
+    if result is None:
         raise InputError(f"{name} is {value!r}, expected a number")
-    try:
-        result = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} is {value!r}, expected a number") from None
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result
@@ -101,11 +101,7 @@ def refuse_masked(name: str, value: object) -> None:
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
-@overload
-def instance(name: str, value: object, kind: type[T], expected: str) -> T: ...
-@overload
-def instance(name: str, value: object, kind: tuple[type, ...], expected: str) -> object: ...
-def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> object:
+def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str) -> T:
     """Return a value of the expected type, or raise `InputError` with the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
@@ -190,11 +186,9 @@ class FrozenArrays:
     """Mixin for frozen dataclasses: makes arrays read-only, and copies writeable arrays first."""
 
     def __post_init__(self) -> None:
-        this: Any = self
-        for item in fields(this):
-            value = getattr(self, item.name)
+        for name, value in [*vars(self).items()]:
             if isinstance(value, np.ndarray) and value.flags.writeable:
-                object.__setattr__(self, item.name, frozen(value.copy()))
+                object.__setattr__(self, name, frozen(value.copy()))
 
     def __setstate__(self, state: dict[str, object]) -> None:
         # deepcopy and most pickle protocols create new writeable arrays, so they are frozen again.

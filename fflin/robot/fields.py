@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -128,17 +128,19 @@ def _coefficients(what: str, value: object, robot: Robot) -> dict[str, float]:
     return found
 
 
-def range_of(name: str, value: Any) -> Range:
+def range_of(name: str, value: object) -> Range:
     """Return (least, largest) from this pair or from one magnitude."""
-    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
-        least, largest = (number(f"limit of '{name}'", x) for x in value)
+    what = f"limit of '{name}'"
+    bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
+    if len(bounds) == 2:
+        least, largest = (number(what, x) for x in bounds)
     else:
-        largest = number(f"limit of '{name}'", value)
+        largest = number(what, value)
         least = -largest
     if least > largest:
         raise InputError(
-            f"limit of '{name}' is {value}, expected a largest magnitude of at least 0, or bounds "
-            "(least, largest)"
+            f"{what} is {value}, expected a largest magnitude of at least 0, or bounds (least, "
+            "largest)"
         )
     return least, largest
 
@@ -249,12 +251,12 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
+def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[str, Range]]:
     """Return the saturation limits of the inputs for `simulate`, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
-    for part in limits if several else [limits]:
+    for part in limits if isinstance(limits, list | tuple) and several else [limits]:
         if isinstance(part, str):
             if part != "urdf":
                 raise InputError(

@@ -398,13 +398,7 @@ class Robot(Coordinates):
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
-    @cached_property
-    def idle_coordinates(self) -> tuple[str, ...]:
-        """Coordinates that make M singular, because they can move together without moving any mass.
-
-        Most robots have no such coordinates.
-        """
-        return idle_coordinates(self)
+    idle_coordinates = cached_property(idle_coordinates)
 
     @cached_property
     def wheels(self) -> dict[str, float]:

@@ -97,17 +97,14 @@ def locked_model(
     return _reduced(model, indices, q), left, tuple(locked)
 
 
-def requested(lock: Any) -> dict[str, float | None]:
+def requested(lock: object) -> dict[str, float | None]:
     """Return locks as {joint or pattern: value}; the value None means the neutral position."""
-    try:
-        names = [lock] if isinstance(lock, str) else list(lock)
-    except TypeError:
-        names = [None]
+    names = [lock] if isinstance(lock, str) or not isinstance(lock, Iterable) else [*lock]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
             f"lock has type {type(lock).__name__}, expected {{joint: value}} or names of joints"
         )
-    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
+    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(map(str, names))
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:

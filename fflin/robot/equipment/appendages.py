@@ -461,9 +461,9 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(entries)
 
 
-def _text(what: str, value: Any) -> str:
+def _text(what: str, value: object) -> str:
     printable = isinstance(value, str) and value.strip() and value.isprintable()
-    if not printable or (what == "name" and set(value) & set("*?[]")):
+    if not printable or (what == "name" and set(str(value)) & set("*?[]")):
         raise InputError(
             f"{what} of an appendage is {value!r}, expected a name, without *, ?, [ and ]"
         )
