@@ -67,7 +67,7 @@ class Joint(NamedTuple):
         omega = math.sqrt(stiffness / self.inertia)
         return omega, 0.5 * damping / (self.inertia * omega)
 
-    def place(self, q: Array, value: float) -> None:
+    def place(self, q: Array, value: float | Array) -> None:
         """Write this joint's value [rad|m|kg^0.5 m] into a configuration q (nq,)."""
         if self.unbounded:
             q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
