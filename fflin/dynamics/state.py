@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from itertools import compress
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -114,21 +115,21 @@ class StateMap:
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state.
-        self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        self._order = np.array([3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp)
         # The inverse map. `spread` writes the entries of mimic joints afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
         self._flat_transposed = np.ascontiguousarray(self._flat.T)
         # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
-        self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
+        self._scale = np.array([1.0] * 6 + [*map(attrgetter("scale"), joints)])
         self._scaled = bool((self._scale != 1.0).any())
         # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
-        self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        self._idx_q = np.array([*map(attrgetter("idx_q"), joints)], dtype=np.intp)
+        self.unbounded = np.flatnonzero([*map(attrgetter("unbounded"), joints)])
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
@@ -428,9 +429,9 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups = {
-            group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
-        }
+        self.groups: dict[str, Indices] = {}
+        for group in dict.fromkeys(groups):
+            self.groups[group] = np.flatnonzero(np.array(groups) == group)
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
@@ -439,12 +440,13 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
-        self.wrench_columns: list[tuple[int, Indices, Array]] = [
-            (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
-            for joint, items in carried.items()
-        ]
+        self.wrench_columns: list[tuple[int, Indices, Array]] = []
+        self._of_carried: list[int] = []
+        for joint, items in carried.items():
+            places, wrenches = zip(*items, strict=True)
+            self.wrench_columns.append((joint, np.array(places), np.column_stack(wrenches)))
+            self._of_carried += places
         self.carried = bool(carried)  # whether columns depend on the configuration
-        self._of_carried = [at for items in carried.values() for at, _ in items]
 
     def columns(self, data: pin.Data, q: Array) -> Array:
         """Return B_u (6 + n, nu), the generalised force in base axes per unit input (6.1)."""

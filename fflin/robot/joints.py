@@ -157,12 +157,12 @@ class Coordinates:
     _as_made: tuple[pin.Model, pin.Model] | None
     _removed: tuple[str, ...]
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints, in state order."""
         return tuple(joint.name for joint in self.joints)
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of independent joints."""
         return len(self.joints)
@@ -186,7 +186,8 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        self.follow(q)
+        for follower in self.followers:
+            follower.place(q)
         return q
 
     def follow(self, q: Array) -> None:
