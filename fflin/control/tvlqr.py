@@ -136,7 +136,8 @@ def tvlqr(
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
             residual = Interpolant(t, P, K, (A, B, Q, R), 0.0).residual(at)
-    return GainSchedule(
+    return GainSchedule._of(
+        traj,
         t=t,
         K=K,
         P=P,
@@ -150,12 +151,7 @@ def tvlqr(
         dt=dt,
         weights=rule,
         knots=traj.t,
-        **{key: getattr(traj, key) for key in _OF_REGULATOR},
     )
-
-
-_OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold", "frame")
-_OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
@@ -328,19 +324,17 @@ def tvkalman(
         ]
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)
-    return FilterSchedule(
-        t=at_samples.t,
+    return FilterSchedule._of(
+        at_samples,
         L=np.concatenate((L, L[-1:])),
         P=P,
         A=maps[:, :, :nx],
         B=maps[:, :, nx:],
-        **{key: getattr(at_samples, key) for key in "CDy"},
         W=np.array(disturbed),
         V=V,
         residual=residual,
         robot=traj.robot.name,
         dt=dt,
-        **{key: getattr(traj, key) for key in _OF_FILTER},
     )
 
 

@@ -59,9 +59,9 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups = {
-            group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
-        }
+        self.groups: dict[str, Indices] = {}
+        for group in dict.fromkeys(groups):
+            self.groups[group] = np.flatnonzero(np.array(groups) == group)
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
@@ -70,12 +70,13 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
-        self.wrench_columns: list[tuple[int, Indices, Array]] = [
-            (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
-            for joint, items in carried.items()
-        ]
+        self.wrench_columns: list[tuple[int, Indices, Array]] = []
+        self._of_carried: list[int] = []
+        for joint, items in carried.items():
+            places, wrenches = zip(*items, strict=True)
+            self.wrench_columns.append((joint, np.array(places), np.column_stack(wrenches)))
+            self._of_carried += places
         self.carried = bool(carried)  # whether columns depend on the configuration
-        self._of_carried = [at for items in carried.values() for at, _ in items]
 
     def columns(self, data: pin.Data, q: Array) -> Array:
         """Return B_u (6 + n, nu), the generalised force in base axes per unit input (6.1)."""

@@ -13,6 +13,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import StateMap
+from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
 # The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
@@ -61,9 +62,10 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides = [
-            joint.idx_q for joint in robot.joints if joint.prismatic and joint.kind != "modal"
-        ]
+        self._slides: list[int] = []
+        for joint in robot.joints:
+            if joint.prismatic and joint.kind != "modal":
+                self._slides.append(joint.idx_q)
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -141,23 +143,23 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
     # largest principal moment, and its mass times the squared length of the path to it. The path
     # runs from joint to joint, with prismatic joints within `STROKE`.
-    joints = model.joints.tolist()
-    slides = [joint.shortname().startswith("JointModelP") for joint in joints]
-    if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):
-        return None
-    inertias, parents = model.inertias.tolist(), model.parents.tolist()
-    placements = model.jointPlacements.tolist()
-    distances = [0.0] * len(joints)
-    for index in range(2, len(joints)):
-        step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
-        distances[index] = distances[parents[index]] + step
-    masses = [item.mass for item in inertias]
-    moments = [
+    joints, inertias = model.joints.tolist(), model.inertias.tolist()
+    placements, parents = model.jointPlacements.tolist(), model.parents.tolist()
+    slides, distances = [False] * len(joints), [0.0] * len(joints)
+    masses, moments = [0.0] * len(joints), [0.0] * len(joints)
+    for index, item in enumerate(inertias):
+        if index > ROOT:
+            kind = joints[index].shortname()[:11]
+            if kind not in ("JointModelR", "JointModelP"):
+                return None
+            slides[index] = kind == "JointModelP"
+            step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
+            distances[index] = distances[parents[index]] + step
+        masses[index] = item.mass
         # The largest row sum of an inertia matrix is a bound of its largest principal moment.
-        item.mass * (distance + float(np.linalg.norm(item.lever))) ** 2
-        + float(np.abs(item.inertia).sum(axis=0).max())
-        for item, distance in zip(inertias, distances, strict=True)
-    ]
+        turning = float(np.abs(item.inertia).sum(axis=0).max())
+        arm = distances[index] + float(np.linalg.norm(item.lever))
+        moments[index] = item.mass * arm**2 + turning
     bounds: Array = np.empty(model.nv)
     for index in range(len(joints) - 1, 1, -1):
         bounds[joints[index].idx_v] = masses[index] if slides[index] else moments[index]
@@ -226,7 +228,9 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
+        self._stored: list[tuple[int, Array]] = []
+        for joint, momentum in robot.stored_momentum:
+            self._stored.append((joint, skew(momentum)))
         self._field = state.field
         self._still = np.zeros(robot.nv)
 

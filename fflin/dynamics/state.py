@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from itertools import compress
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -113,21 +114,21 @@ class StateMap:
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state.
-        self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        self._order = np.array([3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp)
         # The inverse map. `spread` writes the entries of mimic joints afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
         self._flat_transposed = np.ascontiguousarray(self._flat.T)
         # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
-        self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
+        self._scale = np.array([1.0] * 6 + [*map(attrgetter("scale"), joints)])
         self._scaled = bool((self._scale != 1.0).any())
         # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
-        self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        self._idx_q = np.array([*map(attrgetter("idx_q"), joints)], dtype=np.intp)
+        self.unbounded = np.flatnonzero([*map(attrgetter("unbounded"), joints)])
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation

@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.errors import FflinError, FileError, InputError, listed, require_known
+from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, vector
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
@@ -245,13 +245,11 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         entries, verified = _columns(source) if table else read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
-    try:
+    with located(str(source)):
         entries = _entries(entries, robot) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
         frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
         return arguments(entries, robot, hold, frame, verified)
-    except FflinError as error:
-        raise type(error)(f"{source}: {error}") from None
 
 
 def arguments(

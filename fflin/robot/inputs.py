@@ -70,7 +70,7 @@ class Input:
         `count` numbers the inputs of one type; the default names of thrusters and wheels contain
         this number.
         """
-        return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
+        return tuple(map(f"{self.GROUP}.{{}}".format, self.ENTRIES))
 
 
 class WrenchInput(Input, ABC):

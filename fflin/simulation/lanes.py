@@ -313,11 +313,6 @@ def carried_out(plan: Plan, engine: str) -> Recording:
     spent = time.perf_counter() - began
     if spent > LONG_RUN and slower:
         once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-        _log.warning(
-            "fflin: the simulation took %.0f s in Python; engine='compiled' (--engine compiled) "
-            "would take about %.0f s%s",
-            spent,
-            _FRACTION * spent,
-            once,
-        )
+        said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled) would"
+        _log.warning(f"fflin: {said} take about %.0f s%s", spent, _FRACTION * spent, once)
     return run
