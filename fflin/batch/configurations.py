@@ -9,7 +9,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -307,7 +307,7 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
     return low, high
 
 
-def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Any]) -> Array:
+def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
     """Return copies (count, nq) of `start` with other values of the named joints."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
@@ -345,8 +345,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 def follow_rows(robot: Robot, q: Array) -> None:
     """Set the mimic joints of configurations (N, nq) from the joints that they follow."""
     for joint, leader, multiplier, offset in robot.followers:
-        at: Any = multiplier * values(q, column(leader)) + offset
-        joint.place(q.T, at)
+        joint.place(q.T, multiplier * values(q, column(leader)) + offset)
 
 
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:

@@ -99,7 +99,7 @@ def write_rows(
                 )
 
 
-def _checksum(entries: Mapping[str, Any]) -> NDArray[np.uint8]:
+def _checksum(entries: Mapping[str, object]) -> NDArray[np.uint8]:
     """Return the SHA-256 digest (32,) of arrays and strings."""
     return np.frombuffer(bytes.fromhex(content_digest(entries)), np.uint8)
 

@@ -126,7 +126,7 @@ class LinearBatch(FrozenArrays):
     _drift: Array | None
     # Fields of the models that are not fields of the batch: the same at all points, or taken from
     # the robot.
-    _asked: Mapping[str, Any]
+    _asked: Mapping[str, object]
     verified: bool = True
 
     def __len__(self) -> int:
@@ -363,7 +363,7 @@ _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None
 _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
-def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
+def fields_of_model(common: Mapping[str, object]) -> dict[str, object]:
     """Return the fields that are the same for all models and are not fields of a batch."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 

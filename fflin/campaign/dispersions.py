@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,13 +19,13 @@ from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned
-from fflin.campaign.spreads import SEED, SEEDS, inverse_of
+from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import Tree, loads_of
+from fflin.kernel.tree import Tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
@@ -52,7 +52,7 @@ class Column(NamedTuple):
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
     at: list[int]  # indices of the states, bodies, joints, ...
     axis: int
-    inverse: Callable[[Array], Array]  # inverse distribution function
+    inverse: Inverse
 
 
 class Bound(NamedTuple):
@@ -92,7 +92,7 @@ class Dispersions:
         self._known |= {"delay": ("delay",), "seed": (SEED,), "frequency": modes}
         # Indices of the joints of the modes, in the order of the names.
         self._modes = [robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, tuple[Callable[[Array], Array], str]]] = {}
+        by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
             if kind not in kinds or not head:
@@ -132,7 +132,7 @@ class Dispersions:
                     f"'{name}' and '{other}' disperse the same mass; disperse only one of them"
                 )
 
-    def _add(self, kind: str, spreads: Mapping[str, Any], kinds: str) -> None:
+    def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
         """Add the columns of a kind from {name: (inverse distribution function, tie or "")}."""
         robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
@@ -160,7 +160,7 @@ class Dispersions:
             **nominal._asdict(),
             "frequency": nominal.stiffness[self._modes],
         }.get(kind)
-        draws: dict[str, tuple[Callable[[Array], Array], list[int]]] = {}
+        draws: dict[str, tuple[Inverse, list[int]]] = {}
         for at, (inverse, tied) in sorted(found.items()):
             own = names[at]
             if kind not in ("state", "delay"):
@@ -182,10 +182,10 @@ class Dispersions:
                 self.columns.append(Column(name, kind, targets, axis, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, str]]:
+        self, kind: str, spreads: Mapping[str, tuple[Inverse, str]]
+    ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: key} for keys without a wildcard."""
-        robot, found, named = self._plant.robot, dict[str, Any](), dict[str, str]()
+        robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=alone.__contains__):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
@@ -335,8 +335,7 @@ class Dispersions:
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
-            loads = loads_of(plant.robot, plant.actuation, tree)
-            turned = in_lanes(plant.robot, tree, loads, self._of("misalignment", drawn))
+            turned = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
             turned["bodies"] += runs.get("bodies", tree.bodies)
             runs |= turned
         if self._kinds & {*_OF_SENSORS}:
@@ -364,11 +363,10 @@ class Dispersions:
                     for joint, (mass, com, inertia) in bodies.items()
                 }
             )
-        springs: dict[str, Any] = {
-            kind: dict(zip(robot.joint_names, values[0].tolist(), strict=True))
-            for kind, values in self._springs(rows).items()
-        }
-        robot = replace(robot, **springs) if springs else robot
+        springs = {"stiffness": robot.stiffness, "damping": robot.damping}
+        for kind, values in self._springs(rows).items():
+            springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))
+        robot = replace(robot, stiffness=springs["stiffness"], damping=springs["damping"])
         if self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = _with_sensor_errors(policy, *errors)
@@ -383,7 +381,7 @@ class Dispersions:
         return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 
-def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: Array) -> object:
+def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
     """Return a policy whose states or outputs (ny,) have these measurement errors."""
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
@@ -393,15 +391,17 @@ def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: Array)
         found: Array = bias + deviation * generator.standard_normal(len(bias))
         return found if given is None else found + np.asarray(given(t))
 
+    if not isinstance(policy, StateFeedback):
+        noisy = copy(policy)
+        vars(noisy)["noise"] = error
+        return noisy
+    K = policy.K
+
     def bind(robot: Robot) -> Policy:
         inner = bound(policy, robot)
-        return lambda t, q, v: np.asarray(inner(t, q, v)) - policy.K @ error(t)
+        return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ error(t)
 
-    if isinstance(policy, StateFeedback):
-        return Bound(bind, policy.lin)
-    noisy = copy(policy)
-    noisy.noise = error
-    return noisy
+    return Bound(bind, policy.lin)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -35,10 +35,13 @@ from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
-from fflin.dynamics.points import point_of
+from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
@@ -211,7 +214,14 @@ class Funnel(Design):
         size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
-    def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
+    def contains(
+        self,
+        t: float,
+        x: ArrayLike | None = None,
+        *,
+        q: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+    ) -> bool:
         """Return whether a state is inside the funnel at time t.
 
         Parameters
@@ -227,7 +237,7 @@ class Funnel(Design):
         rho, state = self.level(t), StateMap(self.robot, frame="local")
         if x is None and q is None:
             raise InputError("no state is given; give x, or q and v")
-        q, v = point_of(state, x, q, v, lambda: (q, v))
+        q, v = point_of(state, x, q, v, partial(start_of, self.robot))
         e = moving_error(state, *self.trajectory.point(t)[:2], q, v)
         return bool(e @ self.cost(t) @ e <= rho)
 
@@ -456,7 +466,7 @@ def runs_from(
     k: int,
     first: int,
     engine: str | None,
-    options: Mapping[str, Any],
+    options: Mapping[str, object],
     judge: Judge | None = None,
 ) -> CampaignJob:
     """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
@@ -472,7 +482,7 @@ def runs_from(
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
-def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
+def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
     """Return {kind: largest error} from a given mapping, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
@@ -488,7 +498,9 @@ def _shown(bounds: Mapping[str, float]) -> str:
     return ", ".join(f"{key} up to {bound:g} {KINDS[key]}" for key, bound in bounds.items())
 
 
-def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int, int]]:
+def _indices(
+    motion: Trajectory, by: GainSchedule, knots: int | Sequence[float]
+) -> list[tuple[int, int]]:
     """Return the indices of the chosen knots in the trajectory and in the schedule."""
     t, own = motion.t - motion.t[0], by.t - by.t[0]
     at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)

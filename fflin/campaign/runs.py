@@ -58,11 +58,11 @@ class CampaignJob:
         given: object,
         seed: int,
         engine: str | None,
-        options: Mapping[str, Any],
+        options: Mapping[str, object],
         judge: Judge | None = None,
     ) -> None:
         self._again = partial(CampaignJob, robot, policy, given, seed, options=options, judge=judge)
-        settings = dict(options)
+        settings: dict[str, Any] = dict(options)
         # A judge compares errors with the errors at the start, so the histories contain the start.
         histories = settings.pop("histories", 0 if judge is None else 1)
         unlimited = settings.pop("unlimited", False)

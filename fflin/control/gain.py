@@ -219,7 +219,7 @@ def make_gain(
     """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
-    return Gain.of(
+    return Gain._of(
         lin,
         K=solution.K @ S,
         P=S.T @ solution.P @ S,

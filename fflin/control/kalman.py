@@ -266,7 +266,7 @@ def kalman(
     if lin.dt:
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
-    return Estimator.of(
+    return Estimator._of(
         whole,
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
@@ -325,7 +325,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
             "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
-    return Compensator.of(
+    return Compensator._of(
         e,
         A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
         B=S @ e.L,
@@ -438,7 +438,7 @@ def tvkalman(
         ]
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)
-    return FilterSchedule.of(
+    return FilterSchedule._of(
         at_samples,
         L=np.concatenate((L, L[-1:])),
         P=P,

@@ -13,10 +13,9 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law, input_limits
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
@@ -25,6 +24,9 @@ from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+# Function of t, q and v that returns the inputs u* of a reference, and the error e from it.
+Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
 
 
 @runtime_checkable
@@ -48,6 +50,13 @@ class Feedback:
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
+
+    def deviation(self, robot: Robot) -> Deviation:
+        """Return f(t, q, v) -> u*, e: the inputs of the reference, and the error from it."""
+        lin, state = self.lin, self.state_map(robot)
+        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
+        near[fed] = lin.x0
+        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
 
 
 @dataclass(eq=False)

@@ -16,12 +16,11 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
+from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import FilterSchedule, GainSchedule, resting_end, steady_regulator
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
@@ -180,7 +179,7 @@ class TrajectoryFeedback(Feedback):
         require_turns(made, origin.nq, robot)
         return state
 
-    def deviation(self, robot: Robot) -> Callable[..., tuple[Array, Array]]:
+    def deviation(self, robot: Robot) -> Deviation:
         """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
         state = self.state_map(robot)
 

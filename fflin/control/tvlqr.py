@@ -22,9 +22,8 @@ from fflin.control.gain import Gain, titled
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.integrators import held_cost
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.fit import require_same
 from fflin.linear.linear_trajectory import LinearTrajectory, transitions
@@ -374,7 +373,7 @@ def tvlqr(
             t, P = riccati.solve_back(at, traj.t, Qf)
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    schedule = GainSchedule.of(
+    schedule = GainSchedule._of(
         traj,
         t=t,
         K=K,

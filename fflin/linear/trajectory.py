@@ -13,18 +13,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Indices, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 
@@ -143,12 +142,10 @@ class Trajectory(Design):
             if rows.shape != (count, size):
                 raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
         for k, t in enumerate(times):
-            try:
+            with located(f"at t = {t:g} s"):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-            except FflinError as error:
-                raise InputError(f"at t = {t:g} s: {error}") from None
         values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
         values["hold"] = self.hold or ("previous" if short else "linear")
         for name, value in values.items():
@@ -302,11 +299,9 @@ class Trajectory(Design):
         target = as_path(path)
         if type(self) is Trajectory and target.suffix == ".csv":
             write_csv(target, self)
-        elif type(self) is Trajectory:
+        else:
             record = record_of(self) | {"input_names": list(self.actuation.names)}
             write_record(target, record, checksummed=self.verified)
-        else:
-            super().save(target)
 
     @staticmethod
     def load(  # type: ignore[override]
@@ -347,10 +342,8 @@ class Trajectory(Design):
 
         source = as_path(path)
         values = read(source, robot, hold, frame)
-        try:
+        with located(str(source)):
             return Trajectory(robot, **values)
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from None
 
     def _within(self, t: float) -> float:
         t = number("t", t)
