@@ -22,8 +22,8 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import Page, corner_points, subtitle
-from fflin.view.scene import body_nodes, body_poses
+from fflin.view.page import Page, subtitle
+from fflin.view.scene import body_poses
 
 _HOST = "127.0.0.1"
 
@@ -78,11 +78,11 @@ class Live:
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         html = page.html(
             "live",
-            corner_points(page.drawing, poses),
+            page.drawing.points(poses),
             follow=bool(follow),
             joints=self._joints,
             names=[*axes, *robot.joint_names],
-            bodies=body_nodes(robot),
+            bodies=page.nodes,
         )
         self._server = Server(html, page.window.commands, self._asked, port)
         self.url = page.window.web_url = self._server.url

@@ -48,16 +48,6 @@ def _object(geometry: dict[str, Any], matrix: Array, about: dict[str, object]) -
     }
 
 
-def body_paths(robot: Robot) -> list[str]:
-    """Return the node name of each body, in the order of Pinocchio's joints from 1 on."""
-    return [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
-
-
-def body_nodes(robot: Robot) -> list[list[str]]:
-    """Return the path of each body's node on a page, in the order of `body_paths`."""
-    return [["meshcat", "robot", path] for path in body_paths(robot)]
-
-
 def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
     """Return the poses (njoints - 1, 7) of all joint frames at q (nq,).
 
@@ -81,15 +71,16 @@ class Drawing:
         sent: set[str] | None = None,
         prefix: str = "",
     ) -> None:
-        self.robot = robot
+        self.robot, self.prefix = robot, prefix
         self._visualizer = visualizer
-        self._paths = body_paths(robot)
+        # Node name of each body, in the order of Pinocchio's joints from 1 on.
+        self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
         sent = set() if sent is None else sent  # meshes that were sent to the page, updated below
         found, self.notes = shapes(robot)  # shapes, and notes about missing drawings
         self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
-            node = visualizer[self._paths[shape.joint - ROOT]]
+            node = visualizer[self.paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
                 about = {"finish": shape.finish, "color": color, "look": look}
                 if look in ("real", "held"):
@@ -112,9 +103,17 @@ class Drawing:
 
     def place(self, poses: Array) -> None:
         """Set the poses of all bodies: (njoints - 1, 7) with x, y, z and quaternion x, y, z, w."""
-        for path, pose in zip(self._paths, poses, strict=True):
+        for path, pose in zip(self.paths, poses, strict=True):
             matrix = pin.XYZQUATToSE3(pose).homogeneous.T.ravel().tolist()
             self._send("set_transform", self._visualizer[path], matrix=matrix)
+
+    def points(self, poses: Array) -> Array:
+        """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
+        found = []
+        for joint, corners in zip(self.bodies, self.corners, strict=True):
+            placement = pin.XYZQUATToSE3(poses[joint - ROOT])
+            found += [placement.act(corner) for corner in corners]
+        return np.array(found)
 
     def _send(self, kind: str, node: Visualizer, **entries: object) -> None:
         node.window.record({"type": kind, "path": node.path.lower(), **entries})
@@ -123,7 +122,7 @@ class Drawing:
         """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
         times = typed(t)
         clips = []
-        for index, path in enumerate(self._paths):
+        for index, path in enumerate(self.paths):
             tracks = [
                 {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
                 {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
