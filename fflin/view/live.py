@@ -22,9 +22,8 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import Recorder, build_page, corner_points, rounded, stage_info, subtitle
-from fflin.view.playback import body_poses
-from fflin.view.scene import Drawing, Visualizer, body_paths
+from fflin.view.page import Page, corner_points, subtitle
+from fflin.view.scene import body_nodes, body_poses
 
 _HOST = "127.0.0.1"
 
@@ -69,28 +68,21 @@ class Live:
         self._speed = speed
         # Clock time and simulation time [s] at the beginning of the shown simulation.
         self._began: tuple[float, float] | None = None
-        self._recorder = Recorder(self._forward)
-        self.meshcat = Visualizer(window=self._recorder)
-        drawing = Drawing(robot, self.meshcat["robot"])
-        self.notes = drawing.notes
+        page = Page(robot, scene, tool, frame, self._forward)
+        self.meshcat, self.notes = page.meshcat, page.drawing.notes
         poses = body_poses(robot, self._data, q)
-        info = stage_info(
-            robot, drawing, poses, scene=scene, subtitle=subtitle(robot), tool=tool, frame=frame
+        page.set_stage(poses, subtitle(robot))
+        axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
+        html = page.html(
+            "live",
+            corner_points(page.drawing, poses),
+            follow=follow,
+            joints=self._joints,
+            names=[*axes, *robot.joint_names],
+            bodies=body_nodes(robot),
         )
-        info |= {
-            "mode": "live",
-            "follow": follow,
-            "points": rounded(corner_points(drawing, poses), info["size"]),
-            "joints": self._joints,
-            "names": [name.partition(".")[2] for name in self._state_map.names[-6 - robot.n :]],
-            "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
-        }
-        info["names"][:6] = [
-            f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"
-        ]
-        page = build_page(info, connect="'self' ws:")
-        self._server = Server(page, self._recorder.commands, self._asked, port)
-        self.url = self._recorder.web_url = self._server.url
+        self._server = Server(html, page.window.commands, self._asked, port)
+        self.url = page.window.web_url = self._server.url
         self.port = self._server.port
         self.show(q)
 

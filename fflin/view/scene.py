@@ -53,6 +53,23 @@ def body_paths(robot: Robot) -> list[str]:
     return [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
 
 
+def body_nodes(robot: Robot) -> list[list[str]]:
+    """Return the path of each body's node on a page, in the order of `body_paths`."""
+    return [["meshcat", "robot", path] for path in body_paths(robot)]
+
+
+def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
+    """Return the poses (njoints - 1, 7) of all joint frames at q (nq,).
+
+    The first mode of a flexible appendage has the pose of the appendage's bent frame.
+    """
+    pin.forwardKinematics(robot.model, data, q)
+    poses = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
+    for bending in bendings(robot).values() if robot.appendages else ():
+        poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, q))
+    return poses
+
+
 class Drawing:
     """Drawing of a robot below a node of a meshcat scene, with a child node for each joint."""
 
