@@ -367,9 +367,8 @@ def funnel(
     2
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
-    instance("schedule", feedback, TrajectoryFeedback, expected)
+    feedback = instance("schedule", followed(schedule, robot), TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)

@@ -151,7 +151,7 @@ class Allocation:
     15
     """
 
-    policy: Any
+    policy: object
     design: Robot
 
     @property
@@ -337,7 +337,7 @@ class Loop(Compensation):
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
-        noise: Any = 0.0
+        noise: Array | float = 0.0
         if self._noise is not None:
             size = len(self.at(t).y0)
             noise = vector("noise(t)", self._noise(t), size, "one value for each output")
@@ -387,8 +387,6 @@ def fed_back(policy: object) -> tuple[str, ...]:
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
-    of: Any = lin if schedule is None else schedule
-    if of is None:
-        return ()
-    used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
+    names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
+    used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(names, used, strict=True) if size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -206,7 +206,7 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
+def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
     """Return the policy to simulate, with commands held for `held` [s].
 
     A gain schedule is replaced by the feedback along its trajectory.

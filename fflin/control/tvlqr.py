@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -348,15 +348,13 @@ def tvlqr(
     require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
     steady = asks_steady(Qf)
-    given, by_rule = list[Any]((Q, R)), Q is None and R is None
-    if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
-    end: Any = steady_end(traj) if steady or by_rule else None
-    if by_rule:
+    if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        *given, _, rule = rule_weights(end, weights, pace=pace)
-    Q, R, _ = cost_weights(traj, given[0], given[1], None)
-    Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
+        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
+    elif weights is not None or Q is None or R is None:
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
+    Q, R, _ = cost_weights(traj, Q, R, None)
+    Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
 
     def at(times: Array) -> riccati.Coefficients:
         A, B = traj.matrices_at(times)
