@@ -191,18 +191,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         with located(f"point {index}"):
             gain = lqr(batch[index], Q, R)
         K[index], residual[index], margin[index] = gain.K, gain.residual, gain.margin
-    return GainBatch(
-        K=K,
-        residual=residual,
-        margin=margin,
-        joint_positions=batch.joint_positions,
-        joint_names=batch.joint_names,
-        state_names=batch.state_names,
-        input_names=batch.input_names,
-        frame=batch.frame,
-        robot=batch.robot,
-        verified=batch.verified,
-    )
+    return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 
 @dataclass(eq=False)

@@ -32,8 +32,8 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
-from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
@@ -367,9 +367,8 @@ def funnel(
     2
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
-    instance("schedule", feedback, TrajectoryFeedback, expected)
+    feedback = instance("schedule", followed(schedule, robot), TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)

@@ -14,18 +14,15 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.coordinates import moving_errors
 from fflin.simulation.report import Curve, curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.gridspec import SubplotSpec
     from matplotlib.lines import Line2D
 
     from fflin.simulation.motion import Motion
 
-_OF_JOINTS = ("joints q_m", "joint rates qdot_m")
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
 # Titles of panels by the group of their curves: states, and wheels.
 _STATES = {
@@ -53,40 +50,53 @@ def resting_from(motion: Motion) -> float | None:
 
 def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | None) -> Figure:
     """Draw a motion; see `plot_motion`."""
-    panels = _panels(motion, show)
-    states = {title: panels.pop(title) for title in list(panels) if title in _STATES.values()}
-    what, errors = _errors(motion)
+    panels, (what, errors) = _panels(motion, show), _errors(motion)
+    states = [title for title in panels if title in _STATES.values()]
+    others = len(panels) - len(states) + 1  # including the drift
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
-    heights += [3.0] * math.ceil((len(panels) + 1) / _ACROSS)  # rows of panels, including the drift
+    heights += [3.0] * math.ceil(others / _ACROSS)
+    joints: dict[str, Line2D] = {}
+    large: dict[str, dict[str, Line2D]] = {}
     with drawing(path, 11.0, 0.3 + sum(heights)) as figure:
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
-        joints: dict[str, Line2D] = {}
-        for place, (title, found) in enumerate(states.items()):
-            row, column = divmod(place, _ACROSS)
-            axes = figure.add_subplot(grid[row * len(per_row), column])
-            _draw(axes, motion.t, found, title)
-            if place == 0 and motion.tracked:
+        spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
+        spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
+        for (row, column), (title, found) in zip(spots, panels.items(), strict=False):
+            axes = figure.add_subplot(grid[row, column])
+            _draw(axes, motion.t, found, title, {x: y.get_color() for x, y in joints.items()})
+            if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
-            if title in _OF_JOINTS:
-                joints |= _named(axes)
+            lines = {str(x.get_label()): x for x in axes.get_lines()}
+            named = {label: line for label, line in lines.items() if label[0] != "_"}
+            if title.startswith("joint"):
+                # One legend below names the joints of all panels, because their names are long.
+                joints |= named if title in states or not joints else {}
+                joints |= {"limit": named["limit"]} if "limit" in named else {}
+            elif len(found) > _MOST_IN_A_PANEL:
+                large[title] = named
             else:
-                axes.legend(handlelength=1.2)
-            if errors:
-                strip = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
+                if many := len(found) > 3:
+                    axes.margins(y=0.3)  # room for the names above the curves
+                axes.legend(ncols=2 if many else 1, handlelength=1.4)
+            if errors and title in states:
+                strip = figure.add_subplot(grid[row + 1, column], sharex=axes)
                 _draw(strip, motion.t, [errors[curve.key] for curve in found], width=1.0)
                 strip.set_ylabel(f"{what}\n{strip.get_ylabel()}".strip())
                 strip.ticklabel_format(axis="y", scilimits=(-2, 3))
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
-        spots = [grid[above + k // _ACROSS, k % _ACROSS] for k in range(len(panels) + 1)]
-        _draw_panels(figure, spots, motion.t, panels, joints if _OF_JOINTS[0] in states else None)
+        for title, named in large.items():
+            _below(figure, named, title, "right" if joints else "center")
+        if joints:
+            limit = {"limit": joints.pop("limit")} if "limit" in joints else {}
+            _below(figure, joints | limit, "joints", "left" if large else "center")
         rest = None if motion.phases else resting_from(motion)
         marks = [*motion.starts[1:].tolist(), *([] if rest is None else [rest])]
         for axes, mark in product(figure.axes, marks):
             axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
-        _drifts(figure.add_subplot(spots[-1]), motion)
+        _draw_drifts(figure.add_subplot(grid[spots[-1]]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
         figure.suptitle(_title(motion), fontsize=11)
@@ -115,33 +125,6 @@ def _panels(motion: Motion, show: Sequence[str] | None) -> dict[str, list[Curve]
     return panels
 
 
-def _draw_panels(
-    figure: Figure,
-    spots: Sequence[SubplotSpec],
-    t: Array,
-    panels: Mapping[str, list[Curve]],
-    joints: dict[str, Line2D] | None,
-) -> None:
-    """Draw panels of inputs and wheels, with the legends for joints and large panels below."""
-    lines = joints or {}
-    colors = {name: line.get_color() for name, line in lines.items()}
-    for spot, (title, found) in zip(spots, panels.items(), strict=False):
-        axes = figure.add_subplot(spot)
-        _draw(axes, t, found, title, colors)
-        if title.startswith("joint"):
-            lines |= {name: x for name, x in _named(axes).items() if name == "limit"}
-        elif len(found) > _MOST_IN_A_PANEL:
-            _below(figure, _named(axes), title, "center" if joints is None else "right")
-        else:
-            if many := len(found) > 3:
-                axes.margins(y=0.3)  # room for the names above the curves
-            axes.legend(ncols=2 if many else 1, handlelength=1.6)
-    if joints is not None:
-        # Put one legend below, because three panels show the same joints and joint names are long.
-        limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
-        _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
-
-
 def _title(motion: Motion) -> str:
     parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
     if motion.linear is not None:
@@ -154,9 +137,8 @@ def _title(motion: Motion) -> str:
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """Return the errors from a reference (attitude in degrees), or else from the linear model."""
     names, units, what = motion.state_names, motion.state_units, "error"
-    if motion.tracked:
+    if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
-        e = moving_errors(motion.frame, motion.x, motion.target)
         sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
         e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
     elif motion.linear is not None:
@@ -208,11 +190,6 @@ def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
     return broken
 
 
-def _named(axes: Axes) -> dict[str, Line2D]:
-    """Return {label: line} of the lines with a label."""
-    return {str(x.get_label()): x for x in axes.get_lines() if str(x.get_label())[0] != "_"}
-
-
 def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -> None:
     """Add a legend below all panels, with as many columns as fit."""
     letters = 150 if side == "center" else 75
@@ -222,7 +199,7 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
     figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
-def _drifts(axes: Axes, motion: Motion) -> None:
+def _draw_drifts(axes: Axes, motion: Motion) -> None:
     # A logarithmic axis has no zero, so smaller drifts are raised to the machine epsilon.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}

@@ -330,25 +330,22 @@ def motion_record(motion: Motion) -> dict[str, object]:
 def _phases(motion: Motion) -> list[list[str]]:
     """Return the table of phases; for a motion from a file, the table lacks the impacts."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
-
-    def row(name: str, when: str, time: float, energy: float, momentum: Array) -> None:
-        sizes = (np.linalg.norm(each) for each in (momentum[3:], momentum[:3]))
-        table.append([name, when, *(f"{x:.4g}" for x in (time, energy, *sizes))])
-
     parts = motion._phases or motion.phases
     pairs = zip((None, *parts), parts, strict=False)
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        start, end = firsts[k], firsts[k + 1] - 1
-        shown, energy, momentum = shorten(name, 28), motion.energy[start], motion.momentum[start]
-        met = isinstance(impact, Impact)
-        if met:
-            change = np.roll(impact.momentum_after - impact.momentum, 3)
-            row(shown, "before", motion.t[start], energy + impact.energy_lost, momentum - change)
-            shown = ""
-        row(shown, "after" if met else "start", motion.t[start], energy, momentum)
-        row("", "end", motion.t[end], motion.energy[end], motion.momentum[end])
+        # Each line with its row, and the energy and momentum that are not of this row.
+        lines = [("start", firsts[k], 0.0, np.zeros(6))]
+        if isinstance(impact, Impact):
+            gone = np.roll(impact.momentum - impact.momentum_after, 3)
+            lines = [("before", firsts[k], impact.energy_lost, gone), ("after", *lines[0][1:])]
+        lines.append(("end", firsts[k + 1] - 1, 0.0, np.zeros(6)))
+        for when, at, energy, momentum in lines:
+            h, p = (motion.momentum[at] + momentum).reshape(2, 3)
+            sizes = motion.t[at], motion.energy[at] + energy, np.linalg.norm(p), np.linalg.norm(h)
+            shown = shorten(name, 28) if when == lines[0][0] else ""
+            table.append([shown, when, *(f"{x:.4g}" for x in sizes)])
     return table
 
 
@@ -377,17 +374,12 @@ def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
         said = f"settled: {which}at the target throughout the run"
     if aside:
         said += f"; not controlled: {_and(aside)}"
-    return f"{said}; saturated inputs: {_full(motion)}"
-
-
-def _full(motion: Motion) -> str:
-    """Return the inputs and wheels at a limit, each with the fraction of the run spent there."""
-    shares: dict[str, float] = {}  # sum for both limits
+    shares: dict[str, float] = {}  # of the run at a limit, summed over both limits
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
-    said = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
-    more = [f"{len(said) - _NAMED} more"] if len(said) > _NAMED else []
-    return ", ".join(said[:_NAMED] + more) or "none"
+    full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
+    more = [f"{len(full) - _NAMED} more"] if len(full) > _NAMED else []
+    return f"{said}; saturated inputs: {', '.join(full[:_NAMED] + more) or 'none'}"
 
 
 def _and(words: list[str]) -> str:

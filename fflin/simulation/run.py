@@ -61,11 +61,6 @@ class Plant:
         self.state, self.robot = state, robot
         self._aba = Aba(state)
         self.actuation = self._aba.actuation
-        if disturbance is not None and not callable(disturbance):
-            raise InputError(
-                f"disturbance has type {type(disturbance).__name__}, expected a function of (t, q, "
-                "v)"
-            )
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu, groups = len(self.actuation.names), self.actuation.groups
@@ -139,16 +134,6 @@ class Plant:
         return force
 
 
-class Histories(NamedTuple):
-    """Histories of energy, of momentum about the centre of mass, and of the centre of mass."""
-
-    energy: Array  # (N,)
-    momentum: Array  # (N, 6)
-    center: Array  # (N, 3)
-    kept: Array  # (N, 6) momentum about the point; in orbit, the Jacobi integral and zeros
-    scale: Array  # (2,) bounds (11.5) of the linear and the angular part of `kept`
-
-
 class Conserved:
     """Momentum (linear, then angular about a fixed point, in world axes), and centre of mass.
 
@@ -175,9 +160,9 @@ class Conserved:
         self._root = robot.model.jointPlacements[ROOT]
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
-        history, per_mass = self.histories(plan.q[None], plan.v[None]), 1.0 / robot.mass
-        self.momentum = self._momentum = history.kept[0]
-        self._center = history.center[0]
+        _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
+        self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
+        per_mass = 1.0 / robot.mass
         # Position and velocity of the centre of mass without external forces, as columns.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
@@ -239,8 +224,13 @@ class Conserved:
         v_b = v[:6]
         v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
-    def histories(self, q: Array, v: Array) -> Histories:
-        """Return the conserved quantities at each row of q (N, nq) and v (N, nv)."""
+    def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the conserved quantities at each row of q (N, nq) and v (N, nv).
+
+        They are energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
+        momentum about the point (N, 6), and bounds (2,) of its linear and its angular part (11.5).
+        In orbit, the Jacobi integral and zeros take the place of the momentum about the point.
+        """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
         near[:, :7] -= self._start
@@ -273,7 +263,7 @@ class Conserved:
             scale = np.array([(np.abs(energy) + np.abs(potential)).max(), 0.0])
             energy += potential
             kept = np.column_stack((energy, np.zeros((rows, 5))))
-        return Histories(energy, momentum, center, kept, scale)
+        return energy, momentum, center, kept, scale
 
     def _of_wheels(self) -> Array:
         """Return the stored momentum (3,) at the last evaluated link poses, in world axes."""
@@ -328,7 +318,11 @@ def go(plan: Plan, hint: str = "") -> Recording:
             follow(weights[stages - 1, : stages + 1], stages == len(weights))
         return a
 
-    stopped, ending, bar = "", ending_of(plan), Progress(plan.options.progress)
+    stopped, ending, bar = (
+        "",
+        ending_of(plan, stop_conditions(plan)),
+        Progress(plan.options.progress),
+    )
     try:
         for step in range(times.steps):
             u = channel.begin(step, t, q, v) if channel else plan.initial
@@ -366,11 +360,8 @@ def stop_conditions(plan: Plan) -> StopConditions:
     return StopConditions(squares=squares, sign=[sign])
 
 
-def ending_of(
-    plan: Plan, stop: StopConditions | None = None
-) -> Callable[[float, Array, Array], str]:
+def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
     """Build a function that returns why a run ends, or an empty text if the run continues."""
-    stop = stop or stop_conditions(plan)
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])
