@@ -284,13 +284,14 @@ class ChunkJob:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
                 with located(f"configuration {start + row}"):
-                    self._write_one({key: each[row] for key, each in rows.items()}, row, out)
+                    self._write_one(rows, row, out)
         return [str(note.message) for note in caught]
 
-    def _write_one(self, point: Mapping[str, Array], row: int, out: Mapping[str, Array]) -> None:
+    def _write_one(self, rows: Rows, row: int, out: Mapping[str, Array]) -> None:
         """Write a row in Python."""
-        q, nv = point["q"], self.shapes["B_lower"][0]
+        q, nv = rows["q"][row], self.shapes["B_lower"][0]
         if not self.only_inertia:
+            point = {key: each[row] for key, each in rows.items()}
             lin = self.linearizer(q, point.get("v"), point.get("u0"))
             for key, array in out.items():
                 array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.removeprefix("_"))
