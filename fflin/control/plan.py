@@ -20,9 +20,8 @@ from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import refuse_orbit
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import chosen_limits

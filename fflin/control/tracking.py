@@ -19,10 +19,9 @@ from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory

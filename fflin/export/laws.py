@@ -20,8 +20,7 @@ from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation, Gridded, Sample, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import Signals, require_same, sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel

@@ -171,7 +171,8 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
         raise InputError(
             f"the model is sampled at dt = {lin.dt:g} s; check the continuous-time model instead"
         )
-    return held_to(tolerance, _checked(robot, lin))
+    found = _checked(robot, lin)
+    return found if tolerance is None else held_to(tolerance, found)
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
@@ -217,7 +218,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     # Only over the attitude and the joint positions does f have terms beyond second order.
     bends = np.zeros(len(point), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
-    slopes = jacobian(lambda z: model.rates(z[:, :nx], z[:, nx:]), point, steps, bends)
+    slopes = jacobian(model.rates, point, steps, bends)
     rounding = _STEP_ULPS * _EPS / difference
     errors = scales.errors(slopes[:, :nx], slopes[:, nx:], steps=steps[:nx], rounding=rounding)
     for block, error in errors.items():
@@ -227,7 +228,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
 
     x0 = state.to_state(q, v, near=lin.x0)
     rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
-    rate, sizes = model.rates(lin.x0[None], lin.u0[None])[0], scales.rates()
+    rate, sizes = model.rates(point[None])[0], scales.rates()
     for name, part in state.groups._asdict().items():
         size = max(_largest(sizes[part]) or 1.0, _largest(rate[part]))
         error = _largest(lin.f0[part] - rate[part]) / size
@@ -256,7 +257,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, steps: Array, tolerance: fl
         measuring, point = Measuring(state, lin.q), np.concatenate((lin.x0, lin.u0))
 
         def y(z: Array) -> Array:
-            _, q, v, a = model.accelerations(z[:, :nx], z[:, nx:])
+            _, q, v, a = model.accelerations(z)
             return np.array([measuring(*each) for each in zip(z[:, :nx], q, v, a, strict=True)])
 
         here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
@@ -266,7 +267,10 @@ def _output_rows(model: Nonlinear, lin: LinearModel, steps: Array, tolerance: fl
         for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
             largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
             errors[name] = (given - slopes[:, part]) / np.maximum(largest, noise[:, part])
-    return [Row("outputs", name, _largest(error), tolerance) for name, error in errors.items()]
+    rows = []
+    for name, error in errors.items():
+        rows.append(Row("outputs", name, _largest(error), tolerance))
+    return rows
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
@@ -416,11 +420,13 @@ class Scales:
     def _speeds(self, v: Array) -> tuple[Array, float, float]:
         """Return speeds (6 + n,) with wheels at 0, the largest rate, and the wheels' momentum."""
         speed, robot = np.abs(self._state.velocities(v)), self._state.robot
-        inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
-        momentum = float(inertia @ speed[6:])
+        momentum = 0.0
+        for i, name in enumerate(robot.joint_names, 6):
+            if name in robot.wheels:
+                momentum += robot.wheels[name] * float(speed[i])
+                speed[i] = 0.0
         for _, stored in robot.stored_momentum:
             momentum += float(np.linalg.norm(stored))
-        speed[6:][inertia > 0.0] = 0.0
         return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
     def rates(self) -> Array:

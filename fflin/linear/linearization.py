@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property, partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,9 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel
@@ -50,8 +49,6 @@ class Prepared:
     sensing : Sensing or None
         None if the outputs are the state.
     moving : bool
-    reference : ndarray (7,)
-        Reference of `map`: position [m] and quaternion x, y, z, w.
     own_reference : bool
         Whether the reference is the base placement at each point.
     free : bool
@@ -75,7 +72,6 @@ class Prepared:
                 "moving=True measures the error in the axes of the moving base, so no reference "
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
-        self.reference = frozen(pin.SE3ToXYZQUAT(state.reference))
         # In orbit, the reference is the orbital frame.
         self.own_reference = reference is None and robot.orbit is None
         require_inertia(robot)
@@ -118,6 +114,11 @@ class Prepared:
             "u0": frozen(np.zeros(nu)),
             "v": frozen(np.zeros(robot.nv)),
         }
+
+    @cached_property
+    def reference(self) -> Array:
+        """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
+        return frozen(pin.SE3ToXYZQUAT(self.map.reference))
 
     @property
     def fields(self) -> dict[str, Any]:

@@ -48,10 +48,11 @@ class Nonlinear:
         self._v: Array = np.zeros((1, aba.state.robot.nv))
         self._a: Array = np.zeros_like(self._v)
         if lin.moving:
-            _, _, self._v, self._a = self.accelerations(lin.x0[None], lin.u0[None])
+            _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
 
-    def accelerations(self, x: Array, u: Array) -> tuple[Chart, Array, Array, Array]:
-        """Return the charts, and q, v and dv/dt in Pinocchio's order, of rows of x and u."""
+    def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
+        """Return charts, and q, v and dv/dt in Pinocchio's order, of rows (x, u) (N, nx + nu)."""
+        x, u = np.split(point, [self.state.nx], axis=1)
         chart, q, v = self.state.points(x)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
         relative = v.copy()
@@ -60,9 +61,9 @@ class Nonlinear:
         a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
         return chart, q, v, a
 
-    def rates(self, x: Array, u: Array) -> Array:
-        """Return dx/dt (N, nx) of rows x (N, nx) and u (N, nu)."""
-        return self._rates(x, *self.accelerations(x, u))
+    def rates(self, point: Array) -> Array:
+        """Return dx/dt (N, nx) of rows (x, u) (N, nx + nu)."""
+        return self._rates(point[:, : self.state.nx], *self.accelerations(point))
 
     def _rates(self, x: Array, chart: Chart, q: Array, v: Array, a: Array) -> Array:
         state = self.state
@@ -91,11 +92,11 @@ class Nonlinear:
         x = np.tile(lin.x0, (7, 1))
         x[:, state.groups.r_b] = 0.0
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
-        chart, q, v, a = near.accelerations(x, np.tile(lin.u0, (7, 1)))
+        chart, q, v, a = near.accelerations(np.hstack((x, np.tile(lin.u0, (7, 1)))))
         expected = near._rates(x, chart, q, v, a)
         # Differences at t = -3 h ... 3 h.
         h = 1e-2 * chart.q0 / (1.0 + np.abs(v[:, 3:]).max(axis=1, keepdims=True))
-        t = np.concatenate([k * h for k in (1, 2, 3, -1, -2, -3)])
+        t = np.concatenate((h, 2.0 * h, 3.0 * h, -h, -2.0 * h, -3.0 * h))
 
         def after_motion(q: Array, v: Array, a: Array) -> Array:
             q, v, a = np.tile(q, (6, 1)), np.tile(v, (6, 1)), np.tile(a, (6, 1))

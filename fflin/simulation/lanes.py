@@ -107,7 +107,7 @@ class LaneLoop:
         self._fresh: list[tuple[Array, Array]] = []
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self.parts, loop.ARGUMENTS)
-        self._work = work_space(self.parts.robot.layout.size)
+        self._work = work_space(self.parts.robot.tree.size)
         self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
         ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
@@ -115,8 +115,7 @@ class LaneLoop:
         self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
         self._of_run = {
             **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
-            **{key: getattr(robot.tree, key) for key in ("bodies", "fixed")},
-            **{key: getattr(robot.loads, key) for key in robot.loads._fields},
+            **robot.tree._asdict(),
             **robot.faults._asdict(),
         }
 

@@ -17,7 +17,7 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOut
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
-from fflin.kernel.tree import batch_tree, layout_of, loads_of
+from fflin.kernel.tree import batch_tree
 from fflin.robot.fields import limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan
@@ -71,19 +71,16 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
 def mechanics_of(plant: Plant) -> forward.Mechanics:
     """Return the kernel's parameters of a robot."""
     robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
+    springs = robot.springs
     assert tree is not None
-    fixed, springs, loads = actuation.fixed, robot.springs, loads_of(robot, actuation, tree)
     return forward.Mechanics(
         tree=tree,
-        layout=layout_of(tree, len(loads.input)),
-        loads=loads,
         gravity=list(robot.gravity),
         index=[joint.idx_q for joint in robot.joints],
         circling=[joint.unbounded for joint in robot.joints],
         scale=[joint.scale for joint in robot.joints],
         springy=(springs.stiffness != 0.0) | (springs.damping != 0.0),
         rest=springs.rest,
-        row=np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1),
         held=[held.start for held in actuation.held],
         triads=plant.triads,
         origin=pin.SE3ToXYZQUAT(plant.state.origin),
@@ -201,7 +198,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
         asking=asks,
         giving=giving,
         point=point,
-        work=np.zeros(max(asks.layout.size, giving.layout.size)),
+        work=np.zeros(max(asks.tree.size, giving.tree.size)),
         problem=allocation.least_squares(least, most, size),
     )
 

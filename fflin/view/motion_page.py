@@ -11,10 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import find_frame, find_joint, frame_index
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion

@@ -21,10 +21,9 @@ import umsgpack
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame

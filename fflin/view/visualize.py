@@ -14,9 +14,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, instance, number, positive, truth, whole
 from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 

@@ -16,7 +16,7 @@ def flown(robot, q, v, u, duration):
     state = fflin.StateMap(robot)
     model = Nonlinear(Aba(state), lin)
     found = solve_ivp(
-        lambda _, x: model.rates(x[None], lin.u0[None])[0],
+        lambda _, x: model.rates(np.r_[x, lin.u0][None])[0],
         (0.0, duration),
         lin.x0,
         method="DOP853",
