@@ -177,6 +177,8 @@ class Plan:
         self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
         self.charted = lin is not None  # the run ends when the base leaves the chart of the state
         self.steered = fed_back(policy)  # states that are known to be fed back
+        # Measurement noise(t) of the policy, if any.
+        self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         self.notes = (*growing(policy), *times.notes)  # for the report
         # Time of the last stage as a fraction of the step, earlier if inputs jump at knots.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
