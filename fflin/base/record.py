@@ -98,9 +98,7 @@ def require_finite(record: Mapping[str, object]) -> None:
     """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
         if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
-            raise InputError(
-                f"{key} has entries that are not finite; only finite values can be saved"
-            )
+            raise InputError(f"{key} is not finite; only finite values can be saved")
 
 
 def text(value: object) -> str:
@@ -198,9 +196,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; save the data in MATLAB with save -v7" * (
-            content[124:128] == b"\0\2IM"
-        )
+        hint = ", but of version 7.3; save it with save -v7" * (content[124:128] == b"\0\2IM")
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
@@ -241,9 +237,7 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
             )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not found:
-        raise ValueError(
-            f"its entry {CHECKSUM} is not in the form that fflin writes; delete this entry"
-        )
+        raise ValueError(f"its entry {CHECKSUM} is not written by fflin; delete this entry")
     return record, bool(found)
 
 

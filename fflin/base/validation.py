@@ -39,17 +39,12 @@ DOUBLE = np.dtype(np.float64)
 
 def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
-    if type(value) is np.ndarray and value.dtype is DOUBLE:
-        array: Array = value
-    else:
-        array = as_double(name, value)
-    if array.shape != (size,):
-        raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
     # For short vectors, Python's sum is faster than NumPy's and overflows without a warning.
-    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
-        index = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
-    return array
+    if type(value) is np.ndarray and value.dtype is DOUBLE and value.shape == (size,):
+        array: Array = value
+        if math.isfinite(sum(array.tolist())):
+            return array
+    return shaped(name, value, (size,), f": {of_what}")
 
 
 def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> Array:
@@ -57,8 +52,8 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
     array = as_double(name, value)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} has entries that are NaN or infinite, expected finite numbers")
+    for at in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise InputError(f"{name}{at} is {array[tuple(at)]}; every entry must be finite")
     return array
 
 

@@ -25,7 +25,7 @@ from fflin.control.policies import Allocation, Policy, StateFeedback, bound, dec
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import Tree, loads_of
+from fflin.kernel.tree import Tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
@@ -335,8 +335,7 @@ class Dispersions:
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
-            loads = loads_of(plant.robot, plant.actuation, tree)
-            turned = in_lanes(plant.robot, tree, loads, self._of("misalignment", drawn))
+            turned = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
             turned["bodies"] += runs.get("bodies", tree.bodies)
             runs |= turned
         if self._kinds & {*_OF_SENSORS}:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Loads, Tree
+from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Input, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
@@ -45,14 +45,14 @@ def misaligned(robot: Robot, angles: Array) -> Robot:
     return robot.replace(inputs=inputs)
 
 
-def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
+def in_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
-    wrench = np.tile(loads.wrench, (count, 1)).reshape(count, -1, 6)
-    stored = np.tile(loads.stored, (count, 1)).reshape(count, -1, 3)
+    wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
+    stored = np.tile(tree.stored, (count, 1)).reshape(count, -1, 3)
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
     bodies = np.zeros((count, tree.bodies.size // 10, 10))
-    inputs, storing = loads.input.tolist(), loads.stored_body.tolist()
+    inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
     for item, own, at in _indexed(robot):
         if not isinstance(item, Thruster | ReactionWheel):
             continue

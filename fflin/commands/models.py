@@ -58,7 +58,7 @@ def info(arguments: Namespace) -> Report:
     import numpy as np
 
     from fflin.control.authority import point_properties
-    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import Actuation
     from fflin.robot.fields import limits_of
     from fflin.robot.summary import robot_info
 

@@ -11,8 +11,7 @@ import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, Mask
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels

@@ -9,10 +9,9 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
@@ -196,17 +195,6 @@ class AccelerationDerivatives(NamedTuple):
         return self.slopes[..., self.c.shape[-1] :]
 
 
-class Gyroscopic(NamedTuple):
-    r"""Gyroscopic torques :math:`-\omega \times h` of stored momentum, and their derivatives."""
-
-    wrenches: pin.StdVec_Force  # on every joint, in its frame
-    force: Array  # generalised force (nv,) of the gyroscopic torques
-    # Derivatives (nv, nv) of `force`. In `by_q` the Jacobian is constant, because RNEA's
-    # derivatives with `wrenches` already include the change of the Jacobian.
-    by_q: Array
-    by_v: Array
-
-
 class Accelerations:
     """Solution of ``M nudot + b = B u`` of a robot, with its derivatives, in base axes."""
 
@@ -261,9 +249,12 @@ class Accelerations:
         self._inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
-        gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
-        if gyroscopic:
-            bias = bias - gyroscopic.force
+        wrenches = actuation.wrenches(u)
+        if self._stored:
+            wrenches, turning, turning_by_q, turning_by_v = self._gyroscopic(
+                q_still, v_still, wrenches
+            )
+            bias = bias - turning
         if tide:
             bias = bias - pull
         force = (u if actuation.default else columns.dot(u)) - state.forces(bias)
@@ -273,13 +264,12 @@ class Accelerations:
 
         # Derivatives of M a + b - B u - springs (3.3), (7.1). The wrenches are constant in the
         # frames of their links, so RNEA's derivatives include -d(B u)/dq.
-        wrenches = gyroscopic.wrenches if gyroscopic else actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
         by_q, by_v, _ = pin.computeRNEADerivatives(
             model, data, q_still, v_still, state.spread(c), *external
         )
-        if gyroscopic:
-            by_q, by_v = by_q - gyroscopic.by_q, by_v - gyroscopic.by_v
+        if self._stored:
+            by_q, by_v = by_q - turning_by_q, by_v - turning_by_v
         if tide:
             by_q = by_q - pull_by_q
         state.project_transposed(by_q, self._by_q_m)
@@ -296,12 +286,19 @@ class Accelerations:
             inverse.dot(columns, by_u)
         return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
-    def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the gyroscopic torques; their `wrenches` include the wrenches of the inputs."""
+    def _gyroscopic(
+        self, q: Array, v: Array, wrenches: pin.StdVec_Force | None
+    ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
+        r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
+
+        They are added to the wrenches of the inputs on every joint, and returned as a generalised
+        force (nv,) with its derivatives (nv, nv) over q and v. In the derivative over q the
+        Jacobian is constant, because RNEA's derivatives with these wrenches already include the
+        change of the Jacobian.
+        """
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in its axes, the torque h x omega is the
         # generalised force J^T [h]x J v (6.3).
-        wrenches = self._actuation.wrenches(u)
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))
@@ -314,4 +311,4 @@ class Accelerations:
             force += jacobian.T @ torque
             by_q += jacobian.T @ momentum @ turned
             by_v += jacobian.T @ momentum @ jacobian
-        return Gyroscopic(wrenches, force, by_q, by_v)
+        return wrenches, force, by_q, by_v

@@ -15,13 +15,12 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, instance
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
-from fflin.control.gain_schedule import GainSchedule
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation, Gridded, Sample, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.control.tvlqr import GainSchedule
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import Signals, require_same, sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
@@ -244,11 +243,6 @@ def _robot_of(given: Any, lin: LinearModel | None) -> Robot | None:
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     """Linearise a robot at the point and reference stored with a gain that was read from a file."""
-    if not gain.placement.size:
-        raise InputError(
-            "the file of the gain does not contain the reference pose, because the file was "
-            "written by an older version; design the gain again"
-        )
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "

@@ -27,6 +27,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 import numba
 import numpy as np
 from llvmlite import ir
+from numba import extending
 from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.core.codegen import CodeLibrary, CPUCodeLibrary
@@ -35,15 +36,6 @@ from numba.core.datamodel import DataModelManager
 from numba.core.dispatcher import _CompileStats
 from numba.core.typing.context import BaseContext as TypingContext
 from numba.core.typing.templates import AttributeTemplate, Signature
-from numba.extending import (
-    infer_getattr,
-    intrinsic,
-    lower_builtin,
-    lower_getattr_generic,
-    models,
-    register_model,
-    type_callable,
-)
 from numba.np.arrayobj import populate_array
 from numba.types import Array, Type, boolean, float64, intp, void
 
@@ -71,8 +63,8 @@ class Lanes(Type):
 lanes = Lanes()
 
 
-@register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):
+@extending.register_model(Lanes)
+class _LanesModel(extending.models.PrimitiveModel):
     def __init__(self, manager: DataModelManager, kind: Lanes) -> None:
         super().__init__(manager, kind, _VECTOR)
 
@@ -111,19 +103,19 @@ def _arithmetic(python: Callable[..., object], generate: Generator) -> None:
     ) -> ir.Value:
         return generate(builder, *_alike(builder, *values), flags=["contract"])
 
-    type_callable(python)(lambda _: typed)
+    extending.type_callable(python)(lambda _: typed)
     for kinds in (Lanes, Lanes), (Lanes, numba.types.Float), (numba.types.Float, Lanes):
-        lower_builtin(python, *kinds)(lowered)
+        extending.lower_builtin(python, *kinds)(lowered)
 
 
 _arithmetic(operator.add, ir.IRBuilder.fadd)
 _arithmetic(operator.sub, ir.IRBuilder.fsub)
 _arithmetic(operator.mul, ir.IRBuilder.fmul)
 _arithmetic(operator.truediv, ir.IRBuilder.fdiv)
-type_callable(operator.neg)(lambda _: lambda value: lanes if value == lanes else None)
+extending.type_callable(operator.neg)(lambda _: lambda value: lanes if value == lanes else None)
 
 
-@lower_builtin(operator.neg, Lanes)
+@extending.lower_builtin(operator.neg, Lanes)
 def _negative(
     _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
 ) -> ir.Value:
@@ -143,7 +135,7 @@ def _operation(
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:
-        @intrinsic
+        @extending.intrinsic
         @wraps(generate)  # numba reads the number of arguments
         def operation(_: TypingContext, *kinds: Type) -> tuple[Signature, Generator]:
             def generated(
@@ -331,13 +323,13 @@ def _numba_type(kind: Kind | Struct[NamedTuple]) -> Type:
     return Array(number, kind.axes, "C") if kind.axes else number
 
 
-@register_model(_StructType)
-class _StructModel(models.PrimitiveModel):
+@extending.register_model(_StructType)
+class _StructModel(extending.models.PrimitiveModel):
     def __init__(self, manager: DataModelManager, kind: _StructType) -> None:
         super().__init__(manager, kind, _WORD.as_pointer())
 
 
-@infer_getattr
+@extending.infer_getattr
 class _Fields(AttributeTemplate):
     key = _StructType
 
@@ -346,7 +338,7 @@ class _Fields(AttributeTemplate):
         return None if found is None else _numba_type(found)
 
 
-@lower_getattr_generic(_StructType)
+@extending.lower_getattr_generic(_StructType)
 def _field(
     context: BaseContext, builder: ir.IRBuilder, kind: _StructType, words: ir.Value, name: str
 ) -> ir.Value:
@@ -383,7 +375,7 @@ def _field(
 def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
     """Return the numba function that interprets an array of words as a struct."""
 
-    @intrinsic
+    @extending.intrinsic
     def opened(_: TypingContext, words: Array) -> tuple[Signature, Generator]:
         def generate(
             context: BaseContext, builder: ir.IRBuilder, _: Signature, values: Sequence[ir.Value]

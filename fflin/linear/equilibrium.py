@@ -10,9 +10,8 @@ import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
 from fflin.base.validation import Array, FrozenArrays, Mask
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ORBITAL, forces_of
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot

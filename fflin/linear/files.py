@@ -26,9 +26,8 @@ from fflin.base.errors import FileError, InputError, listed, located, require_kn
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, vector
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Frame, frame_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array

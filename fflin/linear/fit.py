@@ -9,9 +9,8 @@ import numpy as np
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, vector
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Measuring, Sensing
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot

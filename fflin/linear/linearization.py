@@ -12,10 +12,9 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel

@@ -12,11 +12,10 @@ import pinocchio as pin
 
 from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 
 
 def assemble(

@@ -20,11 +20,10 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, Indices, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 

@@ -88,9 +88,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
     found |= by_name("input or state", of_states, (*keys, *states))
     found |= by_name("input", of_inputs, keys)
-    return {
-        names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
-    }
+    return {names[i]: (max(low, floors[i]), max(up, floors[i])) for i, (low, up) in found.items()}
 
 
 def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
@@ -116,9 +114,7 @@ def _coefficients(what: str, value: object, robot: Robot) -> dict[str, float]:
     """Return the stiffness or damping {joint: value} from a mapping, one value or "urdf"."""
     if isinstance(value, str) and what == "damping":
         if value != "urdf":
-            raise InputError(
-                f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}"
-            )
+            raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: d}}")
         return dict(robot.urdf_damping)
     many = value if isinstance(value, Mapping) else dict.fromkeys(robot.own_joints, value)
     found = _of_joints(what, many, robot)

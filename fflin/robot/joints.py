@@ -109,7 +109,7 @@ Find: TypeAlias = Callable[[str], Joint]
 
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
     """Return {joint: value} from {joint or pattern: value}; ``q_m`` stands for all joints."""
-    return joints_by_name("joint", values, joints, lambda name: find(name).name)
+    return joints_by_name("joint", values, joints, find)
 
 
 class Carried(NamedTuple):

@@ -262,9 +262,7 @@ def _check_model(model: pin.Model, name: str) -> None:
             f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
         }
         for fault in (fault for fault, found in faults.items() if found):
-            raise ModelError(
-                f"'{name}': joint '{model.names[index]}' has {fault}; correct it in the model"
-            )
+            raise ModelError(f"'{name}': joint '{model.names[index]}' has {fault}; correct it")
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:

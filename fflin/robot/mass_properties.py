@@ -44,6 +44,11 @@ _INVOLVED = 0.1
 _ASYMMETRY = 1e-12
 
 
+def dynamic_parameters(model: pin.Model) -> bytes:
+    """Return the mass properties of all bodies, for a hash of the robot."""
+    return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
+
+
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint: body} from the argument of `Robot.with_mass_properties`."""
     given = mapping("bodies", bodies, "body")

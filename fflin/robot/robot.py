@@ -23,6 +23,7 @@ from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
+    dynamic_parameters,
     given_bodies,
     idle_coordinates,
     pieces_of,
@@ -253,9 +254,7 @@ class Robot(Coordinates):
             passive = checked_passive(fields["passive"], self._bare)
             inputs = [x for x in self.inputs if getattr(x, "joint", None) not in passive]
             if not inputs:
-                raise InputError(
-                    "all inputs are torques of passive joints; a model needs at least one input"
-                )
+                raise InputError("all inputs are torques of passive joints; add another input")
             robot = replace(self, passive=passive, inputs=tuple(inputs))
         if "inputs" in fields:
             robot = equipped(robot, inputs=fields["inputs"])
@@ -350,12 +349,8 @@ class Robot(Coordinates):
         model = bare.model.copy()
         for joint, body in bodies.items():
             model.inertias[joint] = body
-        masses, before = (
-            b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
-            for each in (model, bare.model)
-        )
-        digest = self.urdf_sha256
-        if masses != before:
+        digest, masses = self.urdf_sha256, dynamic_parameters(model)
+        if masses != dynamic_parameters(bare.model):
             digest = sha256(digest.encode() + masses).hexdigest()
         other = replace(bare, model=model, urdf_sha256=digest)
         if bare is self:

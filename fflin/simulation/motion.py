@@ -15,10 +15,9 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
 from fflin.dynamics.impact import Impact, joint_called
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
@@ -321,9 +320,9 @@ class Motion(Design):
         columns = labels(names, ["s", *self.state_units, *self.input_units])
         write_table(target, columns, np.column_stack((self.t, self.x, self.u)))
 
-    def plot(self, path: str | Path | None = None, **options: Any) -> Any:
+    def plot(self, path: str | Path | None = None, *, show: Sequence[str] | None = None) -> Figure:
         """Draw the motion by `plot_motion`, and save the figure if a path is given."""
-        return plot_motion(self, path, **options)
+        return plot_motion(self, path, show=show)
 
 
 def require_motion(motion: object) -> Motion:

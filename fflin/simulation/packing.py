@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
@@ -17,7 +14,7 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOut
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
-from fflin.kernel.tree import batch_tree, layout_of, loads_of
+from fflin.kernel.tree import batch_tree
 from fflin.robot.fields import limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan
@@ -71,19 +68,16 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
 def mechanics_of(plant: Plant) -> forward.Mechanics:
     """Return the kernel's parameters of a robot."""
     robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
+    springs = robot.springs
     assert tree is not None
-    fixed, springs, loads = actuation.fixed, robot.springs, loads_of(robot, actuation, tree)
     return forward.Mechanics(
         tree=tree,
-        layout=layout_of(tree, len(loads.input)),
-        loads=loads,
         gravity=list(robot.gravity),
         index=[joint.idx_q for joint in robot.joints],
         circling=[joint.unbounded for joint in robot.joints],
         scale=[joint.scale for joint in robot.joints],
         springy=(springs.stiffness != 0.0) | (springs.damping != 0.0),
         rest=springs.rest,
-        row=np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1),
         held=[held.start for held in actuation.held],
         triads=plant.triads,
         origin=pin.SE3ToXYZQUAT(plant.state.origin),
@@ -105,12 +99,6 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
         u=u,
         path=law.path._replace(along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point),
     )
-
-
-def noise_of(plan: Plan) -> Callable[[float], ArrayLike] | None:
-    """Return the measurement noise(t) of a plan's policy, or None."""
-    noise: Callable[[float], ArrayLike] | None = getattr(decider(plan.policy), "noise", None)
-    return noise
 
 
 def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
@@ -135,7 +123,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
         else:
             law = law._replace(grid=_grid(policy, state.robot.joint_names))
         law = law._replace(near=x0[state.groups.q_m].copy())
-    size, slots = len(law.measured), SLOTS if noisy or noise_of(plan) else 1
+    size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
@@ -201,7 +189,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
         asking=asks,
         giving=giving,
         point=point,
-        work=np.zeros(max(asks.layout.size, giving.layout.size)),
+        work=np.zeros(max(asks.tree.size, giving.tree.size)),
         problem=allocation.least_squares(least, most, size),
     )
 
@@ -210,12 +198,12 @@ def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
     """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
-    motion, schedule, gains = policy.trajectory, policy.schedule, policy.schedule.interpolant
+    motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    pieces = schedule.K if schedule.dt else gains.pieces
-    pieces = pieces.reshape(len(gains.starts), -1, len(u[0]) * state.nx)
+    pieces = schedule.K if schedule.dt else schedule.pieces
+    pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
     if ends:
         last = np.zeros_like(pieces[:1])
         last[0, 0] = policy.end_gain.ravel()
@@ -236,8 +224,8 @@ def _path(
         ends=bool(ends),
         held=held,
         over=policy.over,
-        last=gains.last - gains.first,
-        starts=gains.starts,
+        last=float(schedule.t[-1] - schedule.t[0]),
+        starts=schedule.starts,
         K=pieces.ravel(),
         order=pieces.shape[1],
     )

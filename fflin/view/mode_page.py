@@ -13,8 +13,8 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import Page, corner_points, packed, subtitle
-from fflin.view.scene import Drawing, body_nodes, body_poses
+from fflin.view.page import Page, packed, subtitle
+from fflin.view.scene import Drawing, body_poses
 
 if TYPE_CHECKING:
     from fflin.analysis.modes import Mode, Modes
@@ -51,7 +51,7 @@ def mode_page(
     page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
     swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
     energies = energies_of(robot, lin, [mode.shape for mode in found.vibrations])
-    points = [corner_points(page.drawing, at) for swing in swings for at in swing[:: _PHASES // 4]]
+    points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
     modes = [
         {
             "frequency": mode.frequency,
@@ -63,8 +63,8 @@ def mode_page(
         }
         for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
     ]
-    nodes = body_nodes(robot)
-    html = page.html("modes", np.concatenate(points), period=_PERIOD, bodies=nodes, modes=modes)
+    corners = np.concatenate(points)
+    html = page.html("modes", corners, period=_PERIOD, bodies=page.nodes, modes=modes)
     return html, page.drawing.notes
 
 
@@ -83,8 +83,8 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
 
     # Displacement of the corners per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    rest = corner_points(drawing, body_poses(robot, data, lin.q))
-    moved = np.array([corner_points(drawing, each) - rest for each in poses(small)])
+    rest = drawing.points(body_poses(robot, data, lin.q))
+    moved = np.array([drawing.points(each) - rest for each in poses(small)])
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [
         {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]

@@ -5,29 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import find_frame, find_joint, frame_index
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.run import Plant
-from fflin.view.page import Page, corner_points, packed, subtitle, thrusters
+from fflin.view.page import Page, packed, subtitle
 from fflin.view.panel import panel
-from fflin.view.scene import Drawing, animation, body_nodes, body_poses
+from fflin.view.scene import animation, body_poses
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
-
-# A drawn robot with its poses (N, njoints - 1, 7).
-Moving: TypeAlias = "tuple[Drawing, Array]"
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
@@ -75,14 +71,11 @@ def motion_page(
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
         moving.append((page.draw(robot, "linear", "linear"), poses))
-    held = {
-        caught.prefix: (
-            page.draw(caught.payload, f"held/{caught.prefix}", "held", caught.prefix),
-            at,
-        )
-        for caught, at in payloads(motion, frame, shown)
-    }
-    moving += held.values()
+    held = []
+    for caught, poses in payloads(motion, frame, shown):
+        name = caught.prefix
+        held.append((page.draw(caught.payload, f"held/{name}", "held", name), poses))
+    moving += held
     clips = []
     for each, poses in moving:
         each.place(poses[0])
@@ -94,30 +87,29 @@ def motion_page(
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
-    page.set_stage(film.poses[0], about[0], [each for each, _ in held.values()])
-    size = page.size
-    corners = [frame_points(drawing, film, size)]
-    for each, rows in ((drawing, goals), *held.values()):
-        corners += [corner_points(each, poses) for poses in rows[:: max(1, len(rows) // 24)]]
+    page.set_stage(film.poses[0], about[0], [each for each, _ in held])
+    corners = [frame_points(page, film)]
+    for each, rows in ((drawing, goals), *held):
+        corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
     points = np.concatenate(corners)
     page.floor[2] = float(points[:, 2].min())
     if follow is None:
         # If the whole of a long path were in view, the robot would be only a dot.
-        follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
+        follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
-        points = frame_points(drawing, film, size, follow=True)
+        points = frame_points(page, film, follow=True)
     html = page.html(
         "motion",
         points,
         **panel(robot, motion, shown, goal),
-        **marks(robot, film, tool, size, goals[:1] if motion.phases else goals),
+        **marks(page, film, goals[:1] if motion.phases else goals),
         t=packed(t),
         speed=speed,
         follow=follow,
         target=len(goals) > 0,
         linear=motion.linear is not None,
         phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
-        held=list(held),
+        held=[each.prefix for each, _ in held],
     )
     drawn = [drawing, *(each for each, _ in moving[1:] if each.robot.urdf)]
     return html, tuple(dict.fromkeys(note for each in drawn for note in each.notes))
@@ -130,34 +122,32 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
-def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
+def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: body corners and force tips."""
     chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:
         base = film.poses[index, 0, :3]
-        tip = base + ARROW * size * film.force[index] / strongest
+        tip = base + ARROW * page.size * film.force[index] / strongest
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
-        points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
+        points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
     return np.concatenate(points)
 
 
-def marks(
-    robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
-) -> dict[str, object]:
+def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
     trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
     if len(goals) > 1:
         trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
-    if tool:
+    if page.tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
         if followed:
-            joint, at = find_frame(robot.model, tool)
+            joint, at = find_frame(page.robot.model, page.tool)
             ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
             followed["tool"] = np.array(ends)
     arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
-    nodes = body_nodes(robot)
+    size = page.size
     most = float(np.abs(film.thrust).max(initial=0.0))
     return {
         "trails": [
@@ -180,15 +170,8 @@ def marks(
             if np.any(values)
         ],
         "plumes": [
-            {
-                "path": nodes[joint - ROOT],
-                "position": position.tolist(),
-                "direction": direction.tolist(),
-                "values": packed(film.thrust[:, k]),
-                "most": most,
-                "name": name,
-            }
-            for k, (name, joint, position, direction) in enumerate(thrusters(robot))
+            {**nozzle, "values": packed(film.thrust[:, k]), "most": most, "name": name}
+            for k, (name, nozzle) in enumerate(page.nozzles)
             if most
         ],
     }

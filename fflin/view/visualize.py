@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from warnings import warn
 
 import pinocchio as pin
@@ -14,9 +14,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, instance, number, positive, truth, whole
 from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
@@ -170,9 +169,10 @@ def visualize(
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
-        how: Any = {"scene": scene, "tool": tool, "follow": bool(follow), "frame": frame}
         pace = positive("speed", 1.0 if speed is None else speed)
-        live = Live(robot, start, **how, speed=pace, port=port)
+        live = Live(
+            robot, start, scene=scene, tool=tool, follow=follow, speed=pace, port=port, frame=frame
+        )
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -196,8 +196,9 @@ def visualize(
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        how = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
-        page, notes = motion_page(robot, motion, **how, tool=tool)
+        page, notes = motion_page(
+            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
+        )
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)

@@ -8,9 +8,9 @@ import pytest
 
 import fflin
 from fflin.base.rotation import skew
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Standing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.state import Actuation
 from fflin.linear.state_equations import assemble
 from tests.support.robots import random_point, random_pose
 

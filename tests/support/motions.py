@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Actuation
 from fflin.simulation.motion import Motion
 from tests.support.robots import random_point
 from tests.support.weights import unit_weights

@@ -93,24 +93,20 @@ def _read_as(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except ImportError:
-        raise InputError(
-            "files of Nastran need pyYeti; install it with: pip install 'fflin[nastran]'"
-        ) from None
+        raise InputError("Nastran files need pyYeti: pip install 'fflin[nastran]'") from None
     except Exception as error:  # pyYeti raises whatever its parsing meets
         raise InputError(f"{path} cannot be read as {kind}: {reason(error)}") from None
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     """Return the mask of boundary degrees of freedom, all rigid motions, and the grid points."""
-    punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file()
+    punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file() and "pv_only"
     with _read_as(path, "the assembly file (.asm) of an external superelement"):
         with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
         # A .pch file lists the degrees of freedom that each grid point retains; without the file
         # it retains all six.
-        uset, _, found, *kept = nastran.asm2uset(
-            str(path), try_rdextrn="pv_only" if punched else False
-        )
+        uset, _, found, *kept = nastran.asm2uset(str(path), try_rdextrn=punched)
         rigid = np.asarray(nastran.rbgeom_uset(uset))
         points = uset.loc[(slice(None), 1), "x":"z"].values.astype(float)
     keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
