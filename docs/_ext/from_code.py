@@ -21,6 +21,17 @@ import fflin
 from fflin.commands import cli
 
 
+def titles() -> dict[str, list[str]]:
+    """Return the public names by title, in the order of the stub."""
+    found: dict[str, list[str]] = {}
+    for line in Path(fflin.__file__).with_suffix(".pyi").read_text(encoding="utf-8").splitlines():
+        if line.startswith("# "):
+            names = found[line[2:]] = []
+        elif line.startswith("from "):
+            names.append(line.split()[-1])
+    return found
+
+
 def write(path: Path, text: str) -> None:
     """Write a page only if it differs, so that Sphinx does not read unchanged pages again."""
     if not path.exists() or path.read_text(encoding="utf-8") != text:
@@ -33,7 +44,7 @@ def reference(app: Sphinx) -> None:
     folder = Path(app.srcdir) / "reference"
     head = ".. currentmodule:: fflin\n\n.. autosummary::\n   :nosignatures:\n   :toctree: names\n\n"
     pages = {}
-    for title, names in fflin._PUBLIC.items():
+    for title, names in titles().items():
         page = title.lower().replace(" ", "_")
         rows = "".join(f"   {name}\n" for name in names)
         pages[page] = f"{title}\n{'=' * len(title)}\n\n{head}{rows}"
