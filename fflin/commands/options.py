@@ -541,7 +541,6 @@ def add_command(
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=Help, help=about)
     command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
     forms = {**FORMS, **SPECIAL.get(name, {})}
-    json = {"json": "print the results as one JSON object"}
-    groups: dict[str, dict[str, str]] = {OUTPUT: {}, **OPTIONS[name]}
-    for title, options in groups.items():
-        command.add(title, json | options if title == OUTPUT else options, forms)
+    command.add(OUTPUT, {"json": "print the results as one JSON object"}, forms)
+    for title, options in OPTIONS[name].items():
+        command.add(title, options, forms)

@@ -228,7 +228,8 @@ class Command(argparse.ArgumentParser):
 
     def add(self, title: str, options: Mapping[str, str], forms: Mapping[str, Form]) -> None:
         """Add a group of options {name: help}; `forms` are the forms of their values."""
-        group = self.add_argument_group(title) if title else self
+        groups = {"": self, **{each.title: each for each in self._action_groups}}
+        group = groups.get(title) or self.add_argument_group(title)
         for name, about in options.items():
             if not name:
                 group.description = about
