@@ -1,20 +1,12 @@
 """Controllability of a linear model, with the names of the uncontrollable states."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.mechanics import ConservedMomenta
-from fflin.analysis.names import (
-    combination,
-    grouped,
-    momentum_names,
-    undecided,
-    unsettled,
-)
+from fflin.analysis.mechanics import ConservedMomenta, combination
 from fflin.analysis.ranks import (
     FixedPoles,
     Margin,
@@ -102,7 +94,7 @@ class Controllability(FrozenArrays):
         ]
         if self.uncontrollable:
             lines.append(f"controllable: {', '.join(self.controllable)}")
-            lines.append(f"uncontrollable: {', '.join(grouped(self.uncontrollable))}")
+            lines.append(f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}")
             placed = [f"{what} {count}" for what, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")
         lines += [f"note: {note}" for note in self.notes]
@@ -177,28 +169,43 @@ def controllability(lin: LinearModel) -> Controllability:
     (6, False)
     """
     lin = mechanics.checked(lin)
-    conserved, size = mechanics.conserved(lin), mechanics.state_sizes(lin)
-    part = _by_second_order(lin, conserved) or _by_poles(lin, conserved)
-    fixed, z = part.fixed, conserved.selected
-    rows, names = part.rows, part.names
+    conserved, size = mechanics.conserved(lin), np.tile(np.sqrt(lin.M.diagonal()), 2)
+    found = _by_second_order(lin, conserved)
+    if found is None:
+        z, R = conserved.selected, conserved.rates
+        X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
+        split = split_by_poles(X, lin.B[z], M, lin.dt)
+        found = split.inside, split.rows, None, "eigenvalues", split.fixed.transformed(R)
+    controllable, rows, names, method, fixed = found
     if names is None:
+        z = conserved.selected
         rows = echelon(rows.T, 1.0 / size[z])[0].T
         states = tuple(lin.state_names[i] for i in z)
-        names = tuple(combination(row, states, 1.0 / size[z]) for row in rows)
+        names = [combination(row, states, 1.0 / size[z]) for row in rows]
     others: Array = np.zeros((len(rows), len(lin.A)))
-    others[:, z] = rows
+    others[:, conserved.selected] = rows
     # When the controllable states are named, prefer coordinates on which an input acts directly.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
-    basis, pivots = echelon(conserved.T @ part.controllable, size, np.tile(driven, 2))
+    basis, pivots = echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
-    margin = conserved.margin & fixed.margin
-    doubts = undecided(lin, margin, "controllable", basis.shape[1])
-    if not len(zero):
-        doubts += unsettled(lin, fixed.settling, "stabilizable")
+    fixed = fixed._replace(margin=conserved.margin & fixed.margin)
+    if len(zero):
+        fixed = fixed._replace(decays=False, settling=Margin())
     groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
     weighted = (basis * size[:, None])[: len(groups)]
-    momenta = momentum_names(lin, conserved)
+    momenta, notes = mechanics.momentum_names(lin, conserved), list[str]()
+    rotates = any("angular momentum" in name for name in momenta)
+    if rotates and any(groups[conserved.kept] == "q_m"):
+        notes.append(_LOOPS)
+    if momenta:
+        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
+    if not lin.is_equilibrium():
+        notes.append(
+            "the operating point is not an equilibrium, so the result is valid only for A and B "
+            "frozen at this point"
+        )
+    notes += mechanics.undecided(lin, fixed, "controllable", basis.shape[1], "stabilizable")
     return Controllability(
         dimension=basis.shape[1],
         controllable=tuple(lin.state_names[i] for i in pivots),
@@ -206,37 +213,27 @@ def controllability(lin: LinearModel) -> Controllability:
         rows=np.vstack((conserved.momenta, conserved.coordinates, others)),
         basis=basis,
         fixed_poles=np.concatenate((zero, fixed.poles)),
-        stabilizable=not len(zero) and fixed.decays,
+        stabilizable=fixed.decays,
         reach={
             title: image(unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
             for group, title in titles.items()
             if group in groups
         },
-        method=part.method,
-        margin=margin,
-        notes=(*_notes(lin, conserved, momenta), *doubts),
+        method=method,
+        margin=fixed.margin,
+        notes=tuple(notes),
         robot=lin.robot,
     )
 
 
-class _Part(NamedTuple):
-    """Controllable and uncontrollable parts of a model after its conserved momenta are removed."""
+def _by_second_order(
+    lin: LinearModel, conserved: ConservedMomenta
+) -> tuple[Array, Array, list[str] | None, str, FixedPoles] | None:
+    """Split the 2 r states without conserved momenta at rest; None if the test is inconclusive.
 
-    controllable: Array  # (2 r, d), a basis
-    rows: Array  # (2 r - d, 2 r); no input acts on rows @ z
-    names: tuple[str, ...] | None  # names of `rows`; None if they follow from the states
-    method: str
-    fixed: FixedPoles
-
-
-def _by_poles(lin: LinearModel, conserved: ConservedMomenta) -> _Part:
-    z, R = conserved.selected, conserved.rates
-    X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
-    found = split_by_poles(X, lin.B[z], M, lin.dt)
-    return _Part(found.inside, found.rows, None, "eigenvalues", found.fixed.transformed(R))
-
-
-def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | None:
+    Return a basis (2 r, d) of the controllable subspace, rows (2 r - d, 2 r) on which no input
+    acts, their names or None if these follow from the states, the method, and the fixed poles.
+    """
     source, R = mechanics.at_rest(lin), conserved.rates
     if source is None:
         return None
@@ -246,7 +243,7 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
         everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
-        return _Part(everything, everything[:0], (), "closed form", fixed)
+        return everything, everything[:0], [], "closed form", fixed
     found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
@@ -266,7 +263,7 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
     fixed = found.fixed.transformed(R)
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
-        return _Part(controllable, rows, None, "eigenvalues", fixed)
+        return controllable, rows, None, "eigenvalues", fixed
     # Without damping, each row measures the position or the rate of a vibration that no input
     # drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
@@ -282,21 +279,4 @@ def _by_second_order(lin: LinearModel, conserved: ConservedMomenta) -> _Part | N
             for each in shapes.real.T * system.size:
                 shape = combination(each / np.abs(each).max(), members, np.ones(r))
                 names.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
-    return _Part(controllable, np.vstack(read), tuple(names), "modes", fixed)
-
-
-def _notes(
-    lin: LinearModel, conserved: ConservedMomenta, momenta: tuple[str, ...]
-) -> tuple[str, ...]:
-    notes = []
-    rotates = any("angular momentum" in name for name in momenta)
-    if rotates and any(lin.state_names[i].startswith("q_m.") for i in conserved.kept):
-        notes.append(_LOOPS)
-    if momenta:
-        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
-    if not lin.is_equilibrium():
-        notes.append(
-            "the operating point is not an equilibrium, so the result is valid only for A and B "
-            "frozen at this point"
-        )
-    return tuple(notes)
+    return controllable, np.vstack(read), names, "modes", fixed

@@ -7,6 +7,7 @@ is less sensitive to rounding.
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -55,49 +56,6 @@ _DECAY = 1e-7
 _DEAD = 1e4 * EPS
 
 
-class _Scaled(NamedTuple):
-    """Matrix A in energy coordinates xi, ``x = to_x @ xi``, and time units of `unit` seconds."""
-
-    A: Array
-    to_x: Array
-    from_x: Array
-    unit: float
-    tolerance: float
-
-
-def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale the states to units of energy, and scale time so that A has a norm of about 1."""
-    # Velocities are scaled to L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy.
-    # Positions are scaled likewise and divided by the unit of time. The tolerance is twenty times
-    # the rounding error of M^-1. For a sampled model it is at least twenty times the rounding
-    # error of (A - I)/dt.
-    nv = len(M)
-    p, v = slice(0, nv), slice(nv, None)
-    L = np.linalg.cholesky(M)
-    N = rates_of_positions(X)
-    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
-    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
-    back = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
-    A = back @ X @ to_x
-    turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
-    rate = max(turning, drag, np.sqrt(fall))
-    # Without forces, the unit of time is arbitrary.
-    unit = 1.0 / rate if rate > 0.0 else 1.0
-    if dt:
-        # If the sample time is the period of the only vibration, X contains rounding errors instead
-        # of forces. The unit of time derived from X would then be too long.
-        unit = min(unit, 100.0 * dt)
-    # Positions are divided by the unit of time, which gives positions and velocities the same
-    # units.
-    stretch = np.repeat((unit, 1.0), nv)
-    to_x, back = to_x * stretch, back / stretch[:, None]
-    root = np.sqrt(M.diagonal())
-    condition = float(np.linalg.cond(M / np.outer(root, root)))
-    A = unit * A * stretch / stretch[:, None]
-    noise = EPS * (unit / dt + float(np.linalg.norm(A, 2))) if dt else 0.0
-    return _Scaled(A, to_x, back, unit, 20.0 * max(len(X) * EPS * condition, noise))
-
-
 class Split(NamedTuple):
     """State space of a model, split into a controllable and an uncontrollable part."""
 
@@ -109,39 +67,64 @@ class Split(NamedTuple):
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s."""
-    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. Orthogonal
-    # transformations split off left null vectors until none remain. This also removes the whole
-    # chain of a defective eigenvalue. A staircase algorithm would carry the rounding error of an
-    # ill-conditioned step into the next step.
-    pair = _scaled(X, M, dt)
-    A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
+    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
+    # The states are scaled to units of energy, x = to_x xi. Velocities are scaled to L^T nu with
+    # M = L L^T, so that |xi|^2 is twice the kinetic energy. Positions are scaled likewise and
+    # divided by the unit of time, which gives A a norm of about 1.
+    nv = len(M)
+    p, v = slice(0, nv), slice(nv, None)
+    L = np.linalg.cholesky(M)
+    N = rates_of_positions(X)
+    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
+    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
+    from_x = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
+    A = from_x @ X @ to_x
+    turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
+    rate = max(turning, drag, np.sqrt(fall))
+    # Without forces, the unit of time is arbitrary.
+    unit = 1.0 / rate if rate > 0.0 else 1.0
+    if dt:
+        # If the sample time is the period of the only vibration, X contains rounding errors instead
+        # of forces. The unit of time derived from X would then be too long.
+        unit = min(unit, 100.0 * dt)
+    stretch = np.repeat((unit, 1.0), nv)
+    to_x, from_x = to_x * stretch, from_x / stretch[:, None]
+    A = unit * A * stretch / stretch[:, None]
+    # The tolerance is twenty times the rounding error of M^-1. For a sampled model it is at least
+    # twenty times the rounding error of (A - I)/dt.
+    root = np.sqrt(M.diagonal())
+    noise = len(X) * EPS * float(np.linalg.cond(M / np.outer(root, root)))
+    if dt:
+        noise = max(noise, EPS * (unit / dt + float(np.linalg.norm(A, 2))))
+    # Orthogonal transformations split off left null vectors until none remain. This also removes
+    # the whole chain of a defective eigenvalue. A staircase algorithm would carry the rounding
+    # error of an ill-conditioned step into the next step.
+    A, to = (A.T, to_x.T) if dual else (A, from_x)
     B = unit_columns(to @ drive)
-    inside, margin = np.eye(len(A)), Margin()
-    rest: Array = np.zeros((len(A), 0))
+    inside, margin = np.eye(2 * nv), Margin()
+    rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
-        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, pair.tolerance)
+        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
         margin &= found.transformed(inside)
         if not lost.shape[1]:
             break
         rest = np.hstack((rest, inside @ lost))
         inside = inside @ image(lost, 0.5)[1]
-    nv = len(A) // 2
-    margin = margin.halved().transformed(pair.to_x[nv:, nv:])
-    split = Split(
-        pair.to_x @ inside, pair.to_x @ rest, rest.T @ pair.from_x, FixedPoles(margin=margin)
-    )
-    if not rest.shape[1]:
-        return split
-    rates, vectors = np.linalg.eig(rest.T @ A @ rest)
-    shapes = pair.to_x @ rest @ vectors
-    poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
-    decay = 1.0 - np.abs(poles) if dt else -rates.real
-    least, most = int(decay.argmin()), int(decay.argmax())
-    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
-    if dt and abs(poles[most]) < _DEAD:
-        # Two motions cannot be distinguished if both decay to rounding error within one sample.
-        margin &= decided(1.0, shapes[:, most]).halved()
-    return split._replace(fixed=FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
+    margin = margin.transformed(to_x[nv:, nv:], halved=True)
+    fixed = FixedPoles(margin=margin)
+    if rest.shape[1]:
+        rates, vectors = np.linalg.eig(rest.T @ A @ rest)
+        shapes = to_x @ rest @ vectors
+        poles = 1.0 + dt * rates / unit if dt else rates / unit
+        decay = 1.0 - np.abs(poles) if dt else -rates.real
+        least, most = int(decay.argmin()), int(decay.argmax())
+        slow = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
+        if dt and abs(poles[most]) < _DEAD:
+            # Two motions cannot be distinguished if both decay to rounding error within one sample.
+            margin &= decided(1.0, shapes[:, most]).transformed(1.0, halved=True)
+        settling = slow.transformed(1.0, halved=True)
+        fixed = FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
+    return Split(to_x @ inside, to_x @ rest, rest.T @ from_x, fixed)
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
@@ -157,39 +140,30 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
     found: Array = np.zeros((len(A), 0))
     margin, known = Margin(), np.zeros(0, dtype=complex)
-    for pole in candidates:
-        vectors, at, decision = _left_vectors_at(A, B, complex(pole), tolerance)
+    for start in candidates:
+        pole = complex(start)
+        for _ in range(_REFINEMENTS):
+            at = pole.real if abs(pole.imag) < _SAME_POLE else pole
+            U, values, _ = np.linalg.svd(np.hstack((A - at * np.eye(len(A)), B)))
+            last = U[:, -1]
+            refined = complex(last.conj() @ A @ last)
+            if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
+                break
+            pole = refined
         if (np.abs(known - at) < _SAME_POLE).any():
             continue
-        margin &= decision
+        rank, single = int((values > tolerance).sum()), abs(at.imag) <= _SAME_POLE
+        margin &= judged(values / tolerance, U, rank, 1 if single else 2)
+        vectors = U[:, rank:]
         if not vectors.shape[1]:
             continue
         known = np.append(known, at)
-        parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
-        parts = np.real(parts)
+        parts = np.real(vectors) if single else np.hstack((vectors.real, vectors.imag))
         # Poles that differ only by rounding error have the same vectors, so only new directions
         # are added.
         new = parts - found @ (found.T @ parts)
         found = np.hstack((found, image(new, _SUSPICIOUS)[0]))
     return found, margin
-
-
-def _left_vectors_at(
-    A: Array, B: Array, pole: complex, tolerance: float
-) -> tuple[Array, complex, Margin]:
-    """Return the left null vectors (m, k) at a pole, the refined pole, and the margin."""
-    size = len(A)
-    for _ in range(_REFINEMENTS):
-        shift = pole.real if abs(pole.imag) < _SAME_POLE else pole
-        U, values, _ = np.linalg.svd(np.hstack((A - shift * np.eye(size), B)))
-        last = U[:, -1]
-        refined = complex(last.conj() @ A @ last)
-        if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
-            break
-        pole = refined
-    rank = int((values > tolerance).sum())
-    states = 2 if abs(shift.imag) > _SAME_POLE else 1
-    return U[:, rank:], complex(shift), judged(values / tolerance, U, rank, states)
 
 
 class Unobservable(NamedTuple):
@@ -214,11 +188,17 @@ def unobservable(
     # By symmetry, the uncontrollable motions are the unobservable motions of C_s = S^T, C_v = 0.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
-    at_zero, margin = _missed_at_zero(system, position, velocity)
+    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
+    rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
+    fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
+    unit = slow / fast if fast and slow else 1.0
+    scale = np.concatenate((1.0 / system.size, unit / system.size))
+    basis, at_origin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
+    starts, margin = system.poles
+    margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
+    at_zero = basis * scale[:, None]
     motions, poles = [at_zero], [0j] * at_zero.shape[1]
     slowest = Decision(np.inf)
-    starts, decided_zero = system.poles
-    margin &= decided_zero
     missed: list[tuple[complex, Values]] = []
     for start in starts:
         shapes, pole, judged = _missed_shapes_at(system, position, velocity, complex(start))
@@ -227,15 +207,20 @@ def unobservable(
         margin &= judged
         if not shapes.shape[1]:
             continue
-        if not _simple(system, shapes, pole):
+        # A pole must have as many independent eigenvectors as its multiplicity.
+        D, sizes = system.D.values, np.abs(shapes)
+        change = shapes.T @ (2.0 * pole * system.M + D) @ shapes
+        size = sizes.T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(D)) @ sizes
+        least = np.linalg.svd(change, compute_uv=False)[-1]
+        if not least > _DEFECTIVE * np.linalg.norm(size):
             return None
         missed.append((pole, shapes))
         motion = np.vstack((shapes, pole * shapes))
         pair = [pole, pole.conjugate()] if pole.imag else [pole]
         motions += [motion.real, motion.imag][: len(pair)]
         poles += [each for each in pair for _ in shapes.T]
-        slow = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
-        slowest = min(slowest, Decision(slow, shapes[:, 0]), key=lambda decision: decision.ratio)
+        decay = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
+        slowest = min(slowest, Decision(decay, shapes[:, 0]), key=itemgetter(0))
     known = [pole for pole, _ in missed]
     near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
@@ -248,16 +233,6 @@ def unobservable(
         settling=Margin() if at_zero.shape[1] else decided(slowest.ratio, slowest.at),
     )
     return Unobservable(np.hstack(motions), tuple(missed), fixed)
-
-
-def _missed_at_zero(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:
-    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
-    rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
-    fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
-    unit = slow / fast if fast and slow else 1.0
-    scale = np.concatenate((1.0 / system.size, unit / system.size))
-    basis, margin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
-    return basis * scale[:, None], margin.halved().transformed(1.0 / system.size)
 
 
 def _missed_shapes_at(
@@ -279,8 +254,8 @@ def _missed_shapes_at(
         noise = (position.noise + size * velocity.noise) / weight
         pencil = (s * s * M + s * D + K) / units
         seen = (position.values + s * velocity.values) / weight
-        stack = Noisy(np.vstack((pencil, seen)), np.vstack((spread, noise)))
-        values, vectors, rank, margin = right_vectors(stack, 2 if pole.imag else 1)
+        stack = np.vstack((pencil, seen)), np.vstack((spread, noise))
+        values, vectors, rank, margin = right_vectors(*stack, 2 if pole.imag else 1)
         shapes = vectors / weight[:, None]
         refined = _root(system, shapes[:, -1], pole)
         moved = abs(refined - pole) / size
@@ -305,14 +280,6 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
     if not system.D.values.any():
         return complex(0.0, refined.imag)
     return refined
-
-
-def _simple(system: SecondOrder, shapes: Values, pole: complex) -> bool:
-    """Return whether a pole has as many independent eigenvectors as its multiplicity."""
-    change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
-    size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
-    least = np.linalg.svd(change, compute_uv=False)[-1]
-    return least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
 
 
 def _aliased(poles: Values, dt: float) -> bool:

@@ -1,16 +1,17 @@
-"""A linear model as a mechanical system M a + D v + K s = S u, and its conserved momenta."""
+"""A linear model as a mechanical system M a + D v + K s = S u, its conserved momenta, and names."""
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.analysis.ranks import (
     EPS,
+    FixedPoles,
     Margin,
     Noisy,
     echelon,
@@ -21,9 +22,6 @@ from fflin.analysis.ranks import (
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    pass
 
 # Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
 _SYMMETRIC = 1e-8
@@ -53,12 +51,7 @@ def checked(lin: LinearModel) -> LinearModel:
     for name in "ABCD":
         if not np.isfinite(getattr(lin, name)).all():
             raise InputError(f"{name} of the model has entries that are not finite")
-    warn_of_stiffness(lin)
-    return lin
-
-
-def warn_of_stiffness(lin: LinearModel) -> None:
-    """Warn if a vibration is so fast that orbital effects are within its rounding error."""
+    # Orbital effects may be within the rounding error of a fast vibration.
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
@@ -67,13 +60,9 @@ def warn_of_stiffness(lin: LinearModel) -> None:
             f"the rounding error of joint vibrations at {fastest:.3g} rad/s, so the result may "
             "miss the orbital effects; lock the joints that vibrate",
             FflinWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
-
-
-def state_sizes(lin: LinearModel) -> Array:
-    """Return weights (nx,) that scale the states to comparable sizes by their inertia."""
-    return np.tile(np.sqrt(lin.M.diagonal()), 2)
+    return lin
 
 
 def rate_matrix(lin: LinearModel) -> Array:
@@ -239,8 +228,15 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     basis, pivots = echelon(free / size[:, None], size)
     W = basis.T
     momenta = W @ lin.M
-    coordinates = _driven(X, momenta)
-    if coordinates is None:
+    # Find the coordinates whose rates are the momenta.
+    X11, X12 = X[:nv, :nv], X[:nv, nv:]
+    if not X11.any():
+        coordinates = np.linalg.solve(X12.T, momenta.T).T
+    else:
+        wanted = np.hstack((momenta, np.zeros_like(momenta)))
+        coordinates = np.linalg.lstsq(np.hstack((X12, X11)).T, wanted.T, rcond=None)[0].T
+    error = np.hstack((coordinates @ X12 - momenta, coordinates @ X11))
+    if np.abs(error).max(initial=0.0) > _CONSISTENT * np.abs(momenta).max(initial=0.0):
         pivots, W = pivots[:0], W[:0]
         momenta = coordinates = np.zeros((0, nv))
     kept = np.setdiff1d(np.arange(nv), pivots)
@@ -255,15 +251,96 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     return ConservedMomenta(W, L1, L2, kept, T, margin.transformed(1.0 / size))
 
 
-def _driven(X: Array, momenta: Array) -> Array | None:
-    """Return the coordinates (k, nv) whose rates are the momenta, or None if there are none."""
-    nv = len(X) // 2
-    X11, X12 = X[:nv, :nv], X[:nv, nv:]
-    if not X11.any():
-        found = np.linalg.solve(X12.T, momenta.T).T
-    else:
-        wanted = np.hstack((momenta, np.zeros_like(momenta)))
-        found = np.linalg.lstsq(np.hstack((X12, X11)).T, wanted.T, rcond=None)[0].T
-    error = np.abs(found @ X12 - momenta).max(initial=0.0)
-    error = max(error, np.abs(found @ X11).max(initial=0.0))
-    return found if error <= _CONSISTENT * np.abs(momenta).max(initial=0.0) else None
+# For each group of velocities: name of the momentum, and name of the coordinate whose rate is the
+# momentum.
+_CONSERVED = {
+    "omega_b": ("angular momentum", "base attitude"),
+    "v_b": ("linear momentum", "base position"),
+}
+_OTHER = ("momentum of", "position of")
+
+_AXIS = re.compile(r"(?<!\S)[xyz](?!\S)")
+
+
+def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, ...]:
+    """Name the conserved momenta, and then the coordinates whose rates are these momenta."""
+    nv = len(lin.M)
+    size = np.sqrt(lin.M.diagonal())
+    rates = [name.split(".", 1) for name in lin.state_names[nv:]]
+    momenta, driven = (
+        tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
+        for i in (0, 1)
+    )
+    # The inputs cannot move the named coordinate while the others are fixed, but they may move it
+    # together with the others.
+    only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
+    of_base = all(
+        not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"
+    )
+    rest = "the joints" if only_joints and of_base else "the rest"
+    return (
+        *(combination(row, momenta, size) for row in conserved.weights),
+        *(f"{combination(row, driven, size)} with {rest} fixed" for row in conserved.weights),
+    )
+
+
+def grouped(names: tuple[str, ...]) -> list[str]:
+    """Join names that differ only in their axis, for example to "angular momentum x/y/z"."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        axes = _AXIS.findall(name)
+        key = _AXIS.sub("\0", name) if len(axes) == 1 else name
+        groups.setdefault(key, []).extend(axes[: len(axes) == 1])
+    return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
+
+
+_RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
+
+
+def rate_of(name: str) -> str:
+    """Return the name of the rate of a coordinate, or "" if the name is not a coordinate."""
+    group, _, member = name.partition(".")
+    return f"{_RATES[group]}.{member}" if group in _RATES else ""
+
+
+def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
+    """Format a linear combination by its largest terms; `sizes` makes the weights comparable."""
+    order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
+    largest = abs(weights[order[0]]) * sizes[order[0]]
+    shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
+    terms: list[str] = []
+    for i in shown[:most]:
+        value = f"{abs(weights[i]):.3g}"
+        sign = ("-" if weights[i] < 0.0 else "+") + " " * bool(terms)
+        terms.append(sign + (names[i] if value == "1" else f"{value} {names[i]}"))
+    if len(shown) > most:
+        terms.append(f"+ {len(shown) - most} more")
+    return " ".join(terms).removeprefix("+")
+
+
+def undecided(
+    lin: LinearModel, fixed: FixedPoles, what: str, count: int, settled: str = ""
+) -> tuple[str, ...]:
+    """Return notes on undecided ranks, and on a slowest motion that may or may not decay."""
+    ranks = [
+        f"undecided: {shape(lin, at)} counts as {'' if change < 0 else 'not '}{what}, but the "
+        f"test value is only {ratio:.1g} times its rounding error; {count} or {count + change} "
+        f"of {len(lin.A)} states are {what}"
+        for ratio, at, change in fixed.margin.doubts
+    ]
+    decays = [
+        f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
+        f"only {ratio:.1g} times its rounding error; the model may or may not be {settled}"
+        for ratio, at, _ in fixed.settling.doubts
+    ]
+    return (*ranks, *decays)
+
+
+def shape(lin: LinearModel, at: Values) -> str:
+    """Describe a motion with rates `at` (nv,), real or complex, by its largest coordinates."""
+    size = np.sqrt(lin.M.diagonal())
+    largest = at[int(np.abs(at * size).argmax())]
+    of_base = {"omega_b": "rotation about ", "v_b": "translation along "}
+    pairs = (name.partition(".") for name in lin.state_names[len(lin.M) :])
+    names = tuple(of_base.get(group, "") + (member or group) for group, _, member in pairs)
+    return combination(np.real(at / largest), names, size)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.eigenpairs import natural_modes
+from fflin.analysis.mechanics import checked
+from fflin.analysis.ranks import EPS
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, folded, grid, width
-from fflin.base.validation import Array, Complex, FrozenArrays, instance
-from fflin.dynamics.coordinates import Chart
+from fflin.base.validation import Array, Complex, FrozenArrays, Values
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import effective_shares
@@ -23,6 +24,10 @@ from fflin.robot.joints import ROOT
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
+
+# With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
+# counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
+_NO_STIFFNESS = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,33 +305,20 @@ def modes(lin: LinearModel) -> Modes:
     >>> found.rigid_body, found.frequencies.round(1)
     (13, array([0.9, 1.2]))
     """
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    lin.require_unchanged()
+    lin = checked(lin)
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
-    nx, nv = len(lin.A), len(lin.M)
-    if nx != 2 * nv:
-        raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
-    found = natural_modes(lin)
-    pairs = sorted(found.pairs, key=lambda pair: (abs(pair.pole), pair.pole.real))
-    shapes = []
-    for pair in pairs:
-        positions = np.abs(pair.shape[:nv])
-        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
-        # those of symmetric panels, the shape is scaled by the first one.
-        largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
-        shapes.append(np.asarray(pair.shape / pair.shape[largest], dtype=complex))
-    energies = energy_by_body(lin._robot, lin, shapes)
+    (poles, shapes, margins), rigid_body, zeros, residual = _natural_modes(lin)
+    energies = energies_of(lin._robot, lin, shapes)
+    found = [
+        Mode(pole, shape, margin > 1.0, margin, *energy)
+        for pole, shape, margin, energy in zip(poles, shapes, margins, energies, strict=True)
+    ]
     return Modes(
-        tuple(
-            Mode(pole, shape, margin > 1.0, margin, energy, strain)
-            for (pole, _, margin), shape, energy, strain in zip(
-                pairs, shapes, energies, strain_by_joint(lin._robot, lin, shapes), strict=True
-            )
-        ),
-        found.rigid_body,
-        found.zeros,
-        found.residual,
+        tuple(sorted(found, key=lambda mode: (abs(mode.pole), mode.pole.real))),
+        rigid_body,
+        zeros,
+        residual,
         lin.is_equilibrium(),
         lin.state_names,
         lin.state_units,
@@ -348,56 +340,133 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
     return text
 
 
-def energy_by_body(
+def energies_of(
     robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
-) -> list[Mapping[str, float]]:
-    """Return {body: fraction of the kinetic energy} of shapes (nx,), see `Mode`.
+) -> list[tuple[Mapping[str, float], Mapping[str, float]]]:
+    """Return {body: fraction of the kinetic energy} and {joint: fraction of the elastic energy}.
 
-    Without a robot, the mappings are empty.
+    There is one pair for each of the shapes (nx,), see `Mode`. Without a robot, the mappings are
+    empty.
     """
     if robot is None:
-        return [{} for _ in shapes]
+        return [({}, {}) for _ in shapes]
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart, data = state.chart(lin.q), robot.create_data()
     names = ("base", *list(robot.model.names)[ROOT + 1 :])
     inertias = robot.model.inertias.tolist()[ROOT:]
-    found: list[Mapping[str, float]] = []
+    found = list[tuple[Mapping[str, float], Mapping[str, float]]]()
     for shape in shapes:
-        # In a mode, all velocities are the displacements times the pole.
-        moved = displacement(lin, chart, shape)
-        energies = np.zeros(len(names))
+        moved = shape[: len(shape) // 2]
+        if isinstance(lin, ReducedModel):
+            moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
+        # Displacements in base axes. In a mode, all velocities are the displacements times the
+        # pole.
+        moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
+        kinetic = np.zeros(len(names))
         for part in (moved.real, moved.imag):
             pin.forwardKinematics(robot.model, data, lin.q, state.spread(part))
             twists = data.v.tolist()[ROOT:]
-            energies += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
-        fractions = energies / (energies.sum() or 1.0)
-        order = np.argsort(-fractions.round(9), kind="stable").tolist()
-        found.append({names[i]: float(fractions[i]) for i in order})
+            kinetic += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
+        kinetic /= kinetic.sum() or 1.0
+        order = np.argsort(-kinetic.round(9), kind="stable").tolist()
+        energy = {names[i]: float(kinetic[i]) for i in order}
+        elastic = robot.springs.stiffness * np.abs(moved[6:]) ** 2
+        elastic /= elastic.sum() or 1.0
+        order = np.argsort(-elastic, kind="stable").tolist()
+        strain = {robot.joint_names[i]: float(elastic[i]) for i in order if elastic[i] > 0.0}
+        found.append((energy, strain))
     return found
 
 
-def strain_by_joint(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
-) -> list[Mapping[str, float]]:
-    """Return {joint: fraction of the elastic energy} of shapes (nx,), see `Mode`."""
-    if robot is None:
-        return [{} for _ in shapes]
-    chart = StateMap(robot, reference=lin.reference, frame=lin.frame).chart(lin.q)
-    names = robot.joint_names
-    found: list[Mapping[str, float]] = []
-    for shape in shapes:
-        moved = np.abs(displacement(lin, chart, shape)[6:])
-        energies = robot.springs.stiffness * moved**2
-        order = np.argsort(-energies, kind="stable").tolist()
-        total = energies.sum()
-        found.append({names[i]: float(energies[i] / total) for i in order if energies[i] > 0.0})
-    return found
+def _natural_modes(
+    lin: LinearModel,
+) -> tuple[tuple[list[complex], list[Complex], list[float]], int, int, float]:
+    """Return the modes with nonzero poles, and the counts and residual that `Modes` reports.
+
+    The modes are their poles, with one of each conjugate pair, their shapes (nx,), and the real
+    parts of the poles as multiples of their rounding errors.
+    """
+    nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
+    # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
+    # this size are set to zero.
+    A = lin.A.copy()
+    by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
+    by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
+    # Scale the states and the time so that the largest entries of A are about 1.
+    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
+    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
+    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
+    weight = np.concatenate((fastest * inertia, inertia))
+    found, nullity = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
+    poles, shapes, margins, residual = list[complex](), list[Complex](), list[float](), 0.0
+    for scaled_pole, vector, error in found:
+        if scaled_pole.imag < 0.0:
+            continue
+        oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
+        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
+        shape = vector / weight
+        left = weight * (A @ shape - pole * shape) / fastest
+        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
+        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
+        # those of symmetric panels, the shape is scaled by the first one.
+        positions = np.abs(shape[:nv])
+        largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
+        poles.append(pole)
+        shapes.append(np.asarray(shape / shape[largest], dtype=complex))
+        margins.append(scaled_pole.real / error)
+    return (poles, shapes, margins), nullity, 2 * nv - len(found), residual
 
 
-def displacement(lin: LinearModel, chart: Chart, shape: Complex) -> Complex:
-    """Return the displacements (6 + n,) of a shape: rotation and translation in base axes."""
-    moved = shape[: len(shape) // 2]
-    if isinstance(lin, ReducedModel):
-        moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
-    turned, shifted = chart.J @ moved[:3], chart.R.T @ moved[3:6]
-    return np.concatenate((turned, shifted, moved[6:]))
+def nonzero_eigenpairs(
+    A: Array, tolerance: float
+) -> tuple[list[tuple[complex, Values, float]], int]:
+    """Return (pole, eigenvector, rounding error) of each nonzero pole of A, and the nullity of A.
+
+    A is repeatedly replaced by :math:`V_1^T A V_1`, where the columns of :math:`V_1` are
+    orthonormal and orthogonal to the null space of A. Each step removes zero eigenvalues only. The
+    steps end when A is nonsingular.
+    """
+    # Rounding moves the k zero eigenvalues of a Jordan block by the k-th root of the rounding
+    # error. Zeros are therefore removed before eigenvalues are computed. The caller scales A to
+    # comparable entries. Singular values below n times the tolerance count as zero.
+    n, whole = len(A), A
+    size = float(np.linalg.norm(A))
+    nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
+    steps: list[Array] = []
+    while len(A):
+        used = A.any(axis=0)
+        if used.all():
+            _, singular, transposed = np.linalg.svd(A)
+            rank = int(np.count_nonzero(singular > n * tolerance))
+            if rank == len(A):
+                break
+            complement = np.asarray(transposed[:rank].T)
+        else:
+            # Columns that are exactly zero are removed directly, because a rotation would add
+            # rounding errors.
+            complement = np.eye(len(A))[:, used]
+        steps.append(A @ complement)
+        A = complement.T @ steps[-1]
+    if not len(A):
+        return [], nullity
+    values, right = np.linalg.eig(A)
+    # The left eigenvectors y are scaled to y x = 1. If A is defective, `right` has no inverse, so
+    # the pseudoinverse is used.
+    left = np.linalg.pinv(right, rcond=EPS)
+    pairs: list[tuple[complex, Values, float]] = []
+    for value, y, x in zip(values.tolist(), left, right.T, strict=True):
+        error = 1e2 * EPS * size * min(float(np.linalg.norm(y)), 1.0 / EPS)
+        if value.imag < 0.0 and pairs and pairs[-1][0] == value.conjugate():
+            pairs.append((complex(value), pairs[-1][1].conj(), error))
+            continue
+        for step in reversed(steps):
+            # An eigenvector x of V_1^T A V_1 gives the eigenvector A V_1 x of A, up to a factor.
+            x = step @ x  # noqa: PLW2901 - the same vector in a larger space
+        x /= np.linalg.norm(x)  # noqa: PLW2901
+        # Slow modes lose accuracy in these steps; one inverse iteration restores it.
+        if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
+            near = whole - (value + EPS * size) * np.eye(n)
+            with suppress(np.linalg.LinAlgError):  # singular if the shift is an eigenvalue
+                x = np.linalg.solve(near, x)  # noqa: PLW2901
+        pairs.append((complex(value), x / np.linalg.norm(x), error))
+    return pairs, nullity

@@ -6,7 +6,6 @@ import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.names import combination, undecided, unsettled
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.base.errors import InputError
 from fflin.base.tables import folded
@@ -111,23 +110,22 @@ def observability(lin: LinearModel) -> Observability:
     """
     lin = mechanics.checked(lin)
     motions, fixed, method = _unobservable(lin)
-    size = mechanics.state_sizes(lin)
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
     basis, _ = echelon(motions, size)
     nx, count = basis.shape
     complement = np.linalg.qr(basis * size[:, None], mode="complete")[0][:, count:]
     return Observability(
         dimension=nx - count,
-        unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
+        unobservable=tuple(
+            mechanics.combination(column, lin.state_names, size) for column in basis.T
+        ),
         basis=basis,
         rows=complement.T * size,
         fixed_poles=fixed.poles,
         detectable=fixed.decays,
         method=method,
         margin=fixed.margin,
-        notes=(
-            *undecided(lin, fixed.margin, "observable", nx - count),
-            *unsettled(lin, fixed.settling, "detectable"),
-        ),
+        notes=mechanics.undecided(lin, fixed, "observable", nx - count, "detectable"),
         robot=lin.robot,
     )
 

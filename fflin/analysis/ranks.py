@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.validation import Array, Indices, Values
-
-if TYPE_CHECKING:
-    pass
 
 EPS = float(np.finfo(float).eps)
 
@@ -53,23 +50,22 @@ class Margin(NamedTuple):
 
     def __and__(self, other: Margin) -> Margin:
         """Combine two margins: keep the smallest value counted as nonzero, the largest as zero."""
-        counted, left_out = zip(self, other, strict=True)
-        return Margin(
-            min(counted, key=lambda decision: decision.ratio),
-            max(left_out, key=lambda decision: decision.ratio),
-        )
+        counted = min(self.counted, other.counted, key=itemgetter(0))
+        return Margin(counted, max(self.left_out, other.left_out, key=itemgetter(0)))
 
-    def moved(self, change: Callable[[Values], Values]) -> Margin:
-        """Return the margin with a function applied to its directions."""
-        return Margin(*(d._replace(at=change(d.at)) if d.at.size else d for d in self))
+    def transformed(self, change: Array | float, *, halved: bool = False) -> Margin:
+        """Return the margin with transformed directions, ``change * v`` or ``change @ v``.
 
-    def transformed(self, change: Array) -> Margin:
-        """Return the margin with transformed directions, ``change * v`` or ``change @ v``."""
-        return self.moved(lambda v: change * v if change.ndim == 1 else change @ v)
+        If `halved`, v is the larger half of the direction: its positions or its rates.
+        """
 
-    def halved(self) -> Margin:
-        """Return the margin with the larger half of each direction: its positions or its rates."""
-        return self.moved(lambda v: max(np.split(v, 2), key=np.linalg.norm))
+        def moved(one: Decision) -> Decision:
+            if not one.at.size:
+                return one
+            v = max(np.split(one.at, 2), key=np.linalg.norm) if halved else one.at
+            return one._replace(at=change @ v if np.ndim(change) == 2 else change * v)
+
+        return Margin(moved(self.counted), moved(self.left_out))
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
@@ -103,11 +99,11 @@ class FixedPoles(NamedTuple):
 class Noisy(NamedTuple):
     """Matrix with a bound on the rounding error of each entry."""
 
-    values: Any  # real or complex
+    values: Array
     noise: Array
 
     @classmethod
-    def exact(cls, values: Values) -> Noisy:
+    def exact(cls, values: Array) -> Noisy:
         """Wrap a matrix that has no rounding error."""
         return cls(values, np.zeros(values.shape))
 
@@ -146,19 +142,21 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
-def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
+def right_vectors(
+    values: Values, noise: Array, states: int = 1
+) -> tuple[Array, Values, int, Margin]:
     """Return n singular values, right singular vectors (n, n), the rank, and its margin."""
     # Rows are scaled to unit length, so that a large row does not hide a small one. A row with a
     # large rounding error is scaled to a smaller length, so that it does not hide other rows.
-    n = matrix.values.shape[1]
-    sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
+    n = values.shape[1]
+    sizes, spread = np.linalg.norm(values, axis=1), np.linalg.norm(noise, axis=1)
     real = sizes > 0.0
     if not n or not real.any():
         return np.zeros(n), np.eye(n), 0, Margin()
     least = n * EPS
     weights = 1.0 / np.maximum(sizes[real], spread[real] / least)
     tolerance = SAFETY * max(least, float(np.linalg.norm(spread[real] * weights)))
-    rows = matrix.values[real] * weights[:, None]
+    rows = values[real] * weights[:, None]
     rows = rows if np.imag(rows).any() else np.real(rows)
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
     singular = np.pad(singular, (0, n - len(singular)))
@@ -176,8 +174,8 @@ def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin
 
 def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
     """Return an orthonormal basis (n, k) of the null space, and its margin; see `right_vectors`."""
-    _, vectors, rank, margin = right_vectors(matrix, states)
-    return vectors[:, rank:], margin
+    _, vectors, rank, margin = right_vectors(*matrix, states)
+    return np.real(vectors[:, rank:]), margin
 
 
 def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:

@@ -10,9 +10,14 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.mechanics import checked, conserved, floating_inertia, second_order
-from fflin.analysis.names import undecided
-from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space
+from fflin.analysis.mechanics import (
+    checked,
+    conserved,
+    floating_inertia,
+    second_order,
+    undecided,
+)
+from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, Indices, frozen
@@ -158,7 +163,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         momenta=momenta.momenta @ in_whole,
         coordinates=momenta.coordinates @ in_whole,
         margin=momenta.margin,
-        notes=undecided(lin, momenta.margin, "kept by the reduction", len(z)),
+        notes=undecided(lin, FixedPoles(margin=momenta.margin), "kept by the reduction", len(z)),
     )
     return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
 
@@ -295,8 +300,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
-    idle = ~second_order(source).S.values.any(axis=1)
-    base = [i for i in range(nv) if idle[i] and lin.state_names[i].startswith("r_b.")]
+    driven = np.count_nonzero(second_order(source).S.values, axis=1)
+    base = [i for i in range(nv) if not driven[i] and lin.state_names[i].startswith("r_b.")]
     columns = [*base, *(i + nv for i in base)]
     if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
         base = []  # in rotating axes, each direction affects the others

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from fflin.analysis.controllability import controllability
-from fflin.analysis.mechanics import conserved
-from fflin.analysis.names import grouped
+from fflin.analysis.mechanics import conserved, grouped
 from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.base.errors import (

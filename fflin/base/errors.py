@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
+from types import ModuleType
 
 # _CONTROL matches control characters, which could break a line or control the terminal. _LONG_NAME
 # matches names that are too long to read; each part of a path counts as a name. _LONGEST is the
@@ -170,7 +170,7 @@ class StabilizabilityError(FflinError, ValueError):
     fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
     """
 
-    margin: Any = None
+    margin: object = None
 
 
 class DetectabilityError(FflinError, ValueError):
@@ -191,7 +191,7 @@ class DetectabilityError(FflinError, ValueError):
     fflin.base.errors.DetectabilityError: the outputs do not observe q_b.x, q_b.y, q_b.z, ...
     """
 
-    margin: Any = None
+    margin: object = None
 
 
 class MissingPackageError(FflinError, ImportError):
@@ -280,7 +280,7 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")
 
 
-def optional_package(name: str, needed: str, extra: str) -> Any:
+def optional_package(name: str, needed: str, extra: str) -> ModuleType:
     """Import an optional package, or raise `MissingPackageError` with the command to install it."""
     try:
         return import_module(name)

@@ -102,7 +102,7 @@ def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def joints_by_name(
-    kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], str]
+    kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], object]
 ) -> dict[str, T]:
     """Return {joint: value} from values of joints, patterns or groups; `find` checks one name."""
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
@@ -110,7 +110,8 @@ def joints_by_name(
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}
     for key, value in values.items():
         if key not in many:
-            found[find(str(key).removeprefix("q_m."))] = value
+            find(name := str(key).removeprefix("q_m."))
+            found[name] = value
     return found
 
 

@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -98,9 +98,7 @@ def require_finite(record: Mapping[str, object]) -> None:
     """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
         if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
-            raise InputError(
-                f"{key} has entries that are not finite; only finite values can be saved"
-            )
+            raise InputError(f"{key} is not finite; only finite values can be saved")
 
 
 def text(value: object) -> str:
@@ -108,11 +106,10 @@ def text(value: object) -> str:
     return value if isinstance(value, str) else str(np.asarray(value).item())
 
 
-def texts(value: Any) -> tuple[str, ...]:
+def texts(value: object) -> tuple[str, ...]:
     """Return a list of strings from a record; a single string becomes a list of one."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return (value,) if isinstance(value, str) else tuple(map(text, value))
+    items = value.tolist() if isinstance(value, np.ndarray) else value
+    return tuple(map(text, items)) if isinstance(items, list | tuple) else (text(items),)
 
 
 def figure(value: object) -> float:
@@ -126,7 +123,7 @@ def figures(value: object) -> dict[str, float]:
     return {key: figure(x) for key, x in group.items()}
 
 
-def content_digest(entries: Mapping[str, Any]) -> str:
+def content_digest(entries: Mapping[str, object]) -> str:
     """Return the SHA-256 of arrays or bytes with their names, types and shapes.
 
     All file formats with several parts use this digest. The bytes of a part are hashed in blocks of
@@ -135,8 +132,8 @@ def content_digest(entries: Mapping[str, Any]) -> str:
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for key, value in sorted(entries.items()):
-            binary = isinstance(value, bytes)
-            array = np.frombuffer(value, np.uint8) if binary else np.asarray(value)
+            raw = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
+            array = np.asarray(raw)
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
@@ -199,15 +196,13 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; save the data in MATLAB with save -v7" * (
-            content[124:128] == b"\0\2IM"
-        )
+        hint = ", but of version 7.3; save it with save -v7" * (content[124:128] == b"\0\2IM")
         raise ValueError(f"not a MATLAB file of level 5{hint}")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
-def _of_mat(value: object) -> Any:
+def _of_mat(value: object) -> object:
     """Convert a MATLAB variable: text to str, cells or text rows to a list, a struct to a dict."""
     if not isinstance(value, np.ndarray):
         return value
@@ -220,7 +215,7 @@ def _of_mat(value: object) -> Any:
 
 
 def _to_json(record: Mapping[str, object], checksummed: bool) -> bytes:
-    def plain(value: object) -> Any:
+    def plain(value: object) -> object:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
         return value.tolist() if isinstance(value, np.ndarray) else value
@@ -242,9 +237,7 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
             )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not found:
-        raise ValueError(
-            f"its entry {CHECKSUM} is not in the form that fflin writes; delete this entry"
-        )
+        raise ValueError(f"its entry {CHECKSUM} is not written by fflin; delete this entry")
     return record, bool(found)
 
 
@@ -291,6 +284,12 @@ class Design(FrozenArrays):
         write_record(as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
+    def _of(cls: type[Kind], source: object, **own: Any) -> Kind:
+        """Return a result with `own` fields; other fields are the attributes of `source`."""
+        names = (each.name for each in fields(cls) if each.init and each.name not in own)
+        return cls(**{key: getattr(source, key) for key in names if hasattr(source, key)}, **own)
+
+    @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
         """Read a file that `save` wrote; every value is restored bit for bit.
 
@@ -309,12 +308,7 @@ class Design(FrozenArrays):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
-            values = {
-                item.name: _value(cls, item, record[item.name])
-                for item in _saved(cls)
-                # Files saved by older versions may lack fields that have a default.
-                if item.name in record or item.default_factory is MISSING
-            }
+            values = {item.name: _value(cls, item, record[item.name]) for item in _saved(cls)}
             return cls(**given, **values, verified=verified)
 
 
@@ -323,8 +317,7 @@ def record_of(design: Design) -> Record:
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)
-        if item.name in design.OPEN:
-            value = np.nan_to_num(value, nan=np.nan)
+        value = np.nan_to_num(value, nan=np.nan) if item.name in design.OPEN else value
         record[item.name] = list(value) if isinstance(value, tuple) else value
     return record
 

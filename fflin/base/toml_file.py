@@ -32,11 +32,11 @@ _KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
 _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> bool:
     """Return whether a TOML value is a finite number."""
     # The limit keeps the length of a vector of such numbers finite. It also excludes integers that
     # no float can represent.
-    return type(value) in (int, float) and abs(value) < 1e100
+    return isinstance(value, int | float) and value is not True and abs(value) < 1e100
 
 
 class TomlFile:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import pinocchio as pin
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
@@ -37,40 +37,35 @@ NORM_TOLERANCE = 1e-6
 DOUBLE = np.dtype(np.float64)
 
 
-def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
+def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
-    if type(value) is np.ndarray and value.dtype is DOUBLE:
-        array: Array = value
-    else:
-        array = as_double(name, value)
-    if array.shape != (size,):
-        raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
     # For short vectors, Python's sum is faster than NumPy's and overflows without a warning.
-    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
-        index = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
-    return array
+    if type(value) is np.ndarray and value.dtype is DOUBLE and value.shape == (size,):
+        array: Array = value
+        if math.isfinite(sum(array.tolist())):
+            return array
+    return shaped(name, value, (size,), f": {of_what}")
 
 
-def shaped(name: str, value: ArrayLike, shape: tuple[int, ...], hint: str = "") -> Array:
+def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> Array:
     """Return a new array of finite native floats of a shape, or raise `InputError`."""
     array = as_double(name, value)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} has entries that are NaN or infinite, expected finite numbers")
+    for at in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise InputError(f"{name}{at} is {array[tuple(at)]}; every entry must be finite")
     return array
 
 
-def number(name: str, value: Any) -> float:
+def number(name: str, value: object) -> float:
     """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
-    if isinstance(value, bool | np.bool_ | str):
+    result: float | None = None
+    if isinstance(value, SupportsFloat) and not isinstance(value, bool | np.bool_):
+        with suppress(TypeError, ValueError, OverflowError):
+            result = float(value)
+    if result is None:
         raise InputError(f"{name} is {value!r}, expected a number")
-    try:
-        result = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} is {value!r}, expected a number") from None
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result
@@ -101,11 +96,7 @@ def refuse_masked(name: str, value: object) -> None:
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
 
 
-@overload
-def instance(name: str, value: object, kind: type[T], expected: str) -> T: ...
-@overload
-def instance(name: str, value: object, kind: tuple[type, ...], expected: str) -> object: ...
-def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> object:
+def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str) -> T:
     """Return a value of the expected type, or raise `InputError` with the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
@@ -170,7 +161,7 @@ def is_rotation(R: Array) -> bool:
     return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
 
-def as_double(name: str, value: ArrayLike) -> Array:
+def as_double(name: str, value: object) -> Array:
     """Return a new array of native floats, or raise `InputError` if an entry is not a number."""
     refuse_masked(name, value)
     array = _as_array(name, value)
@@ -190,11 +181,9 @@ class FrozenArrays:
     """Mixin for frozen dataclasses: makes arrays read-only, and copies writeable arrays first."""
 
     def __post_init__(self) -> None:
-        this: Any = self
-        for item in fields(this):
-            value = getattr(self, item.name)
+        for name, value in [*vars(self).items()]:
             if isinstance(value, np.ndarray) and value.flags.writeable:
-                object.__setattr__(self, item.name, frozen(value.copy()))
+                object.__setattr__(self, name, frozen(value.copy()))
 
     def __setstate__(self, state: dict[str, object]) -> None:
         # deepcopy and most pickle protocols create new writeable arrays, so they are frozen again.

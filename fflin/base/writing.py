@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
@@ -24,15 +23,9 @@ from fflin.base.process import same_file
 _MANY = 1000
 
 
-class CommandFiles(NamedTuple):
-    """Output files that a command has yet to write, and input files that it has read."""
-
-    outputs: set[Path]
-    inputs: set[str]
-
-
-# The value is None in a Python session, which may overwrite files that it has read.
-_of_command: ContextVar[CommandFiles | None] = ContextVar("files of a command", default=None)
+# Output files that a command has yet to write, and input files that it has read. The value is None
+# in a Python session, which may overwrite files that it has read.
+_of_command: ContextVar[tuple[set[Path], set[str]] | None] = ContextVar("files", default=None)
 
 
 def as_path(path: object) -> Path:
@@ -52,27 +45,32 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 
 def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
-    what = f"; give the path of a {kind} file"
-    try:
+    with _failing(path, "read"):
         # Only regular files are opened, because opening a pipe would block until another process
         # writes into it.
         if path.exists() and not path.is_file():
-            raise FileError(
-                f"{path}: is {'a folder' * path.is_dir() or 'not a regular file'}{what}"
-            )
+            what = "a folder" if path.is_dir() else "not a regular file"
+            raise FileError(f"{path}: is {what}; give the path of a {kind} file")
         with path.open("rb") as file:
             content = file.read(-1 if limit is None else limit + 1)
-    except FileError:
-        raise
-    except FileNotFoundError:
-        raise FileError(f"{shown(path)}: No such file{missing(path)}") from None
-    except (OSError, ValueError) as error:
-        raise FileError(f"{shown(path)}: cannot be read: {reason(error)}") from None
     if limit is not None and len(content) > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
     remember(path)
     return content
+
+
+@contextmanager
+def _failing(path: Path, what: str) -> Iterator[None]:
+    """Convert errors of the file system to `FileError`."""
+    try:
+        yield
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:
+        if what == "read" and isinstance(error, FileNotFoundError):
+            raise FileError(f"{shown(path)}: No such file{missing(path)}") from None
+        raise FileError(f"{shown(path)}: cannot be {what}: {reason(error)}") from None
 
 
 @contextmanager
@@ -82,7 +80,7 @@ def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterato
     `inputs` are the files known at the start; `read_file` and `remember` add further files.
     """
     check_distinct(*(outputs := list(outputs)))
-    token = _of_command.set(CommandFiles(set(outputs), set()))
+    token = _of_command.set((set(outputs), set()))
     try:
         remember(*inputs)
         yield
@@ -92,10 +90,10 @@ def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterato
 
 def remember(*paths: str | Path) -> None:
     """Register files that a command reads, so that it cannot overwrite them."""
-    if files := _of_command.get():
-        files.inputs.update(map(os.path.abspath, paths))
-        for target in files.outputs:
-            _require_other(target, paths)
+    outputs, inputs = _of_command.get() or (set(), set())
+    inputs.update(map(os.path.abspath, paths))
+    for target in outputs:
+        _require_other(target, paths)
 
 
 def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
@@ -123,20 +121,18 @@ def write_atomically(contents: Mapping[Path, bytes]) -> None:
 def replacing(*targets: Path) -> Iterator[list[Path]]:
     """Yield a new file for each target, which replaces the target on success."""
     written: dict[Path, Path] = {}
-    target = Path()
     try:
         for target in targets:
-            temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
-            temporary.touch(exist_ok=False)  # its mode follows from the umask
+            with _failing(target, "written"):
+                temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
+                temporary.touch(exist_ok=False)  # its mode follows from the umask
             written[temporary] = target
-        yield list(written)
+        with _failing(targets[-1], "written"):
+            yield list(written)
         for temporary, target in list(written.items()):
-            install(temporary, target)
+            with _failing(target, "written"):
+                install(temporary, target)
             del written[temporary]
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{shown(target)}: cannot be written: {reason(error)}") from None
     finally:
         for temporary in written:
             temporary.unlink(missing_ok=True)
@@ -148,27 +144,26 @@ def install(temporary: Path, target: Path) -> None:
     if real.exists():
         os.chmod(temporary, real.stat().st_mode & 0o777)
     os.replace(temporary, real)
-    if files := _of_command.get():
-        files.outputs.discard(target)  # a command may read its own output
+    outputs, _ = _of_command.get() or (set(), set())
+    outputs.discard(target)  # a command may read its own output
 
 
 def followed_path(target: Path) -> Path:
     """Return the target with links followed, or raise `FileError` if it must not be written."""
     real = Path(os.path.realpath(target))
-    try:
-        found = os.stat(real)
-    except FileNotFoundError:
-        if not real.parent.is_dir():
+    with _failing(target, "written"):
+        try:
+            mode = os.stat(real).st_mode
+        except FileNotFoundError:
+            if real.parent.is_dir():
+                return real
             folder = real.parent if os.path.islink(target) else target.parent
             raise FileError(f"{target}: cannot be written: there is no folder {folder}") from None
-        return real
-    except OSError as error:
-        raise FileError(f"{shown(target)}: cannot be written: {reason(error)}") from None
-    if not stat.S_ISREG(found.st_mode):
-        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "not a regular file"
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
         raise FileError(f"{target}: is {kind}; give the name of a file")
-    if files := _of_command.get():
-        _require_other(target, files.inputs)
+    _, inputs = _of_command.get() or (set(), set())
+    _require_other(target, inputs)
     return real
 
 
@@ -178,13 +173,8 @@ def check_output_path(target: Path, endings: tuple[str, ...] = ()) -> None:
 
     if endings:
         check_ending(target, endings)
-    try:
-        with TemporaryFile(prefix=".fflin-", dir=followed_path(target).parent):
-            pass
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written: {reason(error)}") from None
+    with _failing(target, "written"):
+        TemporaryFile(prefix=".fflin-", dir=followed_path(target).parent).close()
 
 
 def check_distinct(*targets: Path | None) -> None:

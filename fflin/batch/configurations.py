@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -20,8 +20,8 @@ from fflin.base.validation import (
     Array,
     as_double,
     dimension,
+    frozen,
     instance,
-    number,
     vector,
     whole,
 )
@@ -200,21 +200,16 @@ def grid(
             raise InputError(
                 f"joint '{name}' is on the grid and in joints=; give it in only one of the two"
             )
-        axis = as_double(f"grid of joint '{name}'", values)
-        if axis.ndim != 1 or not axis.size:
-            raise InputError(f"grid of joint '{name}' has shape {axis.shape}, expected (k,), k > 0")
-        if not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
-            raise InputError(
-                f"grid of joint '{name}' has values that are not finite or do not increase, "
-                "expected increasing finite numbers"
-            )
-        axis.setflags(write=False)
-        checked[name] = axis
+        what = f"grid of joint '{name}'"
+        axis = as_double(what, values)
+        vector(what, axis, max(1, axis.size), "increasing values (k,), k > 0")
+        if (np.diff(axis) <= 0.0).any():
+            raise InputError(f"{what} has values that do not increase, expected increasing numbers")
+        checked[name] = frozen(axis)
     count = math.prod(map(len, checked.values()))
     if count > sys.maxsize:
         raise InputError(f"the grid has {count:,} points, too many to index; give fewer values")
-    start.setflags(write=False)
-    return Grid(robot, checked, start)
+    return Grid(robot, checked, frozen(start))
 
 
 def random_configurations(
@@ -265,8 +260,7 @@ def random_configurations(
     given = instance("ranges", ranges, Mapping, "a mapping {joint: (low, high)}")
     given = by_joint(given, robot.joint_names, robot.joint)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
-    start.setflags(write=False)
-    return RandomConfigurations(robot, count, seed, checked, start)
+    return RandomConfigurations(robot, count, seed, checked, frozen(start))
 
 
 def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
@@ -297,11 +291,7 @@ def content(configurations: Configurations) -> dict[str, object]:
 def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
     if given is not None:
         what = f"range of '{joint.name}'"
-        try:
-            low, high = given
-        except (TypeError, ValueError):
-            raise InputError(f"{what} is {given!r}, expected (low, high)") from None
-        low, high = number(what, low), number("its end", high)
+        low, high = vector(what, given, 2, "(low, high)").tolist()
         if not 0.0 <= high - low < math.inf:
             said = f"{what} is {low:g} to {high:g}"
             raise InputError(f"{said}, expected low <= high with a width that does not overflow")
@@ -317,7 +307,7 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
     return low, high
 
 
-def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Any]) -> Array:
+def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
     """Return copies (count, nq) of `start` with other values of the named joints."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
@@ -355,8 +345,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 def follow_rows(robot: Robot, q: Array) -> None:
     """Set the mimic joints of configurations (N, nq) from the joints that they follow."""
     for joint, leader, multiplier, offset in robot.followers:
-        at: Any = multiplier * values(q, column(leader)) + offset
-        joint.place(q.T, at)
+        joint.place(q.T, multiplier * values(q, column(leader)) + offset)
 
 
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
@@ -381,42 +370,45 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
                 block[row] = robot.checked_configuration(block[row])
         if robot.followers:
             follow_rows(robot, block)
-    rows.setflags(write=False)
-    return rows
+    return frozen(rows)
 
 
-def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
+def checked_velocities(robot: Robot, v: ArrayLike, count: int) -> Array:
     """Return read-only velocities (N, nv) from an array (N, nv), or (nv,) for all points."""
-    if dimension("v", v) == 1:
-        return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
-    rows = _rows("v", v, robot.nv, "one velocity in Pinocchio's order per row", count)
-    for row in range(count) if robot.followers else _not_finite(rows):
-        with located(f"velocity {row}"):
-            robot.checked_velocity(rows[row])
-    rows.setflags(write=False)
-    return rows
+    every = bool(robot.followers)
+    return _checked("v", v, robot.nv, robot.checked_velocity, count, every=every)
 
 
-def checked_inputs(names: tuple[str, ...], u: ArrayLike, count: int) -> Array:
+def checked_inputs(nu: int, u: ArrayLike, count: int) -> Array:
     """Return read-only inputs (N, nu) from an array (N, nu), or (nu,) for all points."""
-    nu = len(names)
-    if dimension("u", u) == 1:
-        return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))
-    rows = _rows("u", u, nu, "the robot's inputs in each row", count)
-    for row in _not_finite(rows):
-        index = int(np.isfinite(rows[row]).argmin())
-        raise InputError(f"u[{row}, {index}] is {rows[row, index]}, expected finite numbers")
-    rows.setflags(write=False)
-    return rows
+
+    def check(row: ArrayLike) -> Array:
+        return vector("u", row, nu, "the robot's inputs")
+
+    return _checked("u", u, nu, check, count)
 
 
-def _not_finite(rows: Array) -> list[int]:
-    """Return the indices of the rows with an entry that is not finite."""
+def _checked(
+    name: str,
+    given: ArrayLike,
+    size: int,
+    check: Callable[[ArrayLike], Array],
+    count: int,
+    *,
+    every: bool = False,
+) -> Array:
+    """Return rows (count, size), checked where an entry is not finite, or `every` one."""
+    if dimension(name, given) == 1:
+        return np.broadcast_to(check(given).copy(), (count, size))
+    rows = _rows(name, given, size, "one row for each point", count)
     with np.errstate(all="ignore"):
-        if np.isfinite(rows.sum()):
-            return []
-    rows_left: list[int] = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
-    return rows_left
+        # A finite sum shows that all entries are finite.
+        sure = not every and np.isfinite(rows.sum())
+    doubtful = np.zeros(count) if sure else ~np.isfinite(rows).all(axis=1) | every
+    for row in np.flatnonzero(doubtful).tolist():
+        with located(f"row {row}"):
+            check(rows[row])
+    return frozen(rows)
 
 
 def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None) -> Array:

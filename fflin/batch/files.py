@@ -90,40 +90,37 @@ def write_rows(
                 file.create_dataset(key, data=value)
             file.attrs.update(texts)
             if checksummed:
-                count = len(next(iter(arrays.values())))
-                row = sum(value.nbytes // count for value in varying.values())
-                chunk = max(1, _CHUNK_BYTES // row)
-                checksums = _chunk_checksums(varying, count, chunk)
+                row = sum(value[:1].nbytes for value in varying.values())
+                file.attrs["chunk"] = chunk = max(1, _CHUNK_BYTES // row)
+                checksums = _chunk_checksums(varying, chunk)
                 file.create_dataset(CHUNK_CHECKSUMS, data=checksums)
                 file.create_dataset(
                     CHECKSUM, data=file_checksum(texts, chunk, checksums, constants)
                 )
-                file.attrs["chunk"] = chunk
 
 
-def chunk_checksum(arrays: Mapping[str, Array]) -> bytes:
-    """Return the SHA-256 digest of a range of rows."""
-    return bytes.fromhex(content_digest(arrays))
+def _checksum(entries: Mapping[str, object]) -> NDArray[np.uint8]:
+    """Return the SHA-256 digest (32,) of arrays and strings."""
+    return np.frombuffer(bytes.fromhex(content_digest(entries)), np.uint8)
 
 
-def _chunk_checksums(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
+def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uint8]:
     """Return the SHA-256 digest (chunks, 32) of each chunk of rows."""
 
-    def checksum(start: int) -> bytes:
-        return chunk_checksum({key: value[start : start + chunk] for key, value in varying.items()})
+    def checksum(start: int) -> NDArray[np.uint8]:
+        return _checksum({key: value[start : start + chunk] for key, value in varying.items()})
 
     # hashlib releases the interpreter lock, so threads hash the chunks in parallel.
     with ThreadPoolExecutor() as pool:
-        checksums = b"".join(pool.map(checksum, range(0, count, chunk)))
-    return np.frombuffer(checksums, np.uint8).reshape(-1, 32)
+        starts = range(0, len(next(iter(varying.values()))), chunk)
+        return np.array(list(pool.map(checksum, starts)))
 
 
 def file_checksum(
     texts: Mapping[str, str], chunk: int, checksums: object, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
     """Return the SHA-256 digest (32,) of a file's content, including the digests of its chunks."""
-    whole = content_digest({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
-    return np.frombuffer(bytes.fromhex(whole), np.uint8)
+    return _checksum({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
 
 
 def read_rows(
@@ -156,9 +153,11 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
     constants = {key: arrays[key] for key in json.loads(texts["constant"])}
     varying = {key: value for key, value in arrays.items() if key not in constants}
     own = {key: value for key, value in texts.items() if key != "request"}
-    whole = chunk > 0 and np.array_equal(checksum, file_checksum(own, chunk, checksums, constants))
-    count = len(next(iter(varying.values())))
-    if not whole or not np.array_equal(checksums, _chunk_checksums(varying, count, chunk)):
+    if not (
+        chunk > 0
+        and np.array_equal(checksum, file_checksum(own, chunk, checksums, constants))
+        and np.array_equal(checksums, _chunk_checksums(varying, chunk))
+    ):
         raise ValueError(DAMAGED)
     return arrays, texts, True
 
@@ -289,9 +288,8 @@ class FileStore:
         """Return whether a chunk is in the file and matches its checksum."""
         with self._reported():
             kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
-            return bool(kept.any()) and kept.tobytes() == chunk_checksum(
-                {key: self._file[key][start:stop] for key in self._shapes}
-            )
+            rows = {key: self._file[key][start:stop] for key in self._shapes if kept.any()}
+            return bool(rows) and np.array_equal(kept, _checksum(rows))
 
     def read(self, stop: int) -> dict[str, Array]:
         """Return the rows before row `stop`."""
@@ -308,8 +306,8 @@ class FileStore:
             for key in self._shapes:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
-            checksum = chunk_checksum({key: arrays[key] for key in self._shapes})
-            self._file[CHUNK_CHECKSUMS][start // self.chunk] = np.frombuffer(checksum, np.uint8)
+            checksum = _checksum({key: arrays[key] for key in self._shapes})
+            self._file[CHUNK_CHECKSUMS][start // self.chunk] = checksum
             self._file.flush()
 
     def complete(self) -> dict[str, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
 from fflin.control.lqr import lqr, near_boundary
 from fflin.control.optimal.riccati import half_size
-from fflin.control.policies import Feedback
+from fflin.control.policies import Feedback, Policy
 from fflin.control.weights import weight
 from fflin.linear.fit import line_up
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
+
     from fflin.control.weights import Weight
     from fflin.robot.robot import Robot
 
@@ -126,7 +128,7 @@ class GainBatch(Design):
         return axes
 
     @cached_property
-    def _interpolator(self) -> Any:
+    def _interpolator(self) -> RegularGridInterpolator:
         from scipy.interpolate import RegularGridInterpolator
 
         # If the rows of a full grid are sorted by joint positions, the last joint varies fastest.
@@ -189,18 +191,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         with located(f"point {index}"):
             gain = lqr(batch[index], Q, R)
         K[index], residual[index], margin[index] = gain.K, gain.residual, gain.margin
-    return GainBatch(
-        K=K,
-        residual=residual,
-        margin=margin,
-        joint_positions=batch.joint_positions,
-        joint_names=batch.joint_names,
-        state_names=batch.state_names,
-        input_names=batch.input_names,
-        frame=batch.frame,
-        robot=batch.robot,
-        verified=batch.verified,
-    )
+    return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 
 @dataclass(eq=False)
@@ -256,7 +247,7 @@ class ScheduledFeedback(Feedback):
         by = self.gains
         return by.grid, by._interpolator.values.reshape(by.K.shape)
 
-    def bind(self, robot: Robot) -> Any:
+    def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot; see `StateFeedback.bind` for errors."""
         lin, gains = self.lin, self.gains
         state = self.state_map(robot)

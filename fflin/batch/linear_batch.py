@@ -13,7 +13,16 @@ import numpy as np
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
-from fflin.base.validation import Array, FrozenArrays, Indices, Mask, frozen, number, refuse_masked
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    Indices,
+    Mask,
+    frozen,
+    number,
+    refuse_masked,
+    vector,
+)
 from fflin.base.writing import as_path
 from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
@@ -117,7 +126,7 @@ class LinearBatch(FrozenArrays):
     _drift: Array | None
     # Fields of the models that are not fields of the batch: the same at all points, or taken from
     # the robot.
-    _asked: Mapping[str, Any]
+    _asked: Mapping[str, object]
     verified: bool = True
 
     def __len__(self) -> int:
@@ -223,9 +232,7 @@ class LinearBatch(FrozenArrays):
         for index, value in self._named(joints).items():
             what = f"joint '{self.joint_names[index]}'"
             if isinstance(value, tuple | list):
-                if len(value) != 2:
-                    raise InputError(f"{what} is {value!r}, expected a value or (low, high)")
-                low, high = (number(what, end) for end in value)
+                low, high = vector(what, value, 2, "(low, high)")
                 at = values(self.q, self.columns[index])
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
@@ -285,16 +292,13 @@ class LinearBatch(FrozenArrays):
             header = json.loads(texts["header"])
             found = _checked_fields(arrays, header, constant)
             ignorable = tuple(header["_ignorable"])
-            n = float(header.get("mean_motion", 0.0))
+            n = float(header["mean_motion"])
         if robot is None:
             asked = {
                 "_certify": partial(_refuse, "certificate", found["robot"]),
                 "_inertia": partial(_refuse, "inertia M", found["robot"]),
                 "_ignorable": partial(given, ignorable),
-                "_limits": dict,
-                "weights": {},
-                "mean_motion": n,
-                "dt": 0.0,
+                **{"weights": {}, "mean_motion": n, "dt": 0.0},
             }
             return LinearBatch(**found, _asked=asked, verified=verified)
         own = robot.urdf_sha256, robot.locked, robot.joint_names, mean_motion(robot)
@@ -303,9 +307,11 @@ class LinearBatch(FrozenArrays):
                 f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
                 "its URDF, joints or orbit; give the robot for which the batch was made"
             )
-        from fflin.linear.linearization import prepare
+        from fflin.linear.linearization import Prepared
 
-        common = prepare(robot, frame=found["frame"], reference=None, moving=found["moving"]).common
+        common = Prepared(
+            robot, frame=found["frame"], reference=None, moving=found["moving"]
+        ).common
         return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
@@ -357,7 +363,7 @@ _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None
 _TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
-def fields_of_model(common: Mapping[str, object]) -> dict[str, Any]:
+def fields_of_model(common: Mapping[str, object]) -> dict[str, object]:
     """Return the fields that are the same for all models and are not fields of a batch."""
     return {key: value for key, value in common.items() if key not in _KINDS}
 
@@ -377,10 +383,7 @@ def _checked_fields(
         found[key] = frozen(array)
     for key in _TEXTS:
         found[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
-    found["columns"] = tuple(
-        (int(first), int(second), float(scale[0]) if scale else 1.0)
-        for first, second, *scale in header["columns"]
-    )
+    found["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
     nx, nu, ny = (len(found[f"{kind}_names"]) for kind in ("state", "input", "output"))
     shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
     for key, shape in shapes.items():

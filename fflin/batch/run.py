@@ -25,17 +25,21 @@ from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from threading import Lock, Thread, local
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from types import NoneType
+from typing import TYPE_CHECKING, ParamSpec, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, Mask, whole
+from fflin.base.validation import Array, Mask, instance, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 # Chunks submitted per worker at a time, so that a worker never waits for its next chunk.
 _QUEUED = 2
@@ -90,11 +94,7 @@ class Execution:
     ) -> None:
         if executor is not None and workers is not None:
             raise InputError("executor and workers are both given; give only one of them")
-        if executor is not None and not hasattr(executor, "submit"):
-            raise InputError(
-                f"executor has type {type(executor).__name__}, expected a "
-                "concurrent.futures.Executor"
-            )
+        instance("executor", executor, (Executor, NoneType), "a concurrent.futures.Executor")
         for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
             if value is not None:
                 whole(name, value, 1)
@@ -300,9 +300,9 @@ class OwnWorkers(Executor):
         self._lock, self._closed = Lock(), False
         self._processes: dict[BaseProcess, Connection] = {}
 
-    def submit(self, fn: Callable[..., object], /, *args: object, **kwargs: object) -> Future[Any]:
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Call a function in a worker process; raise `WorkerDied` if the process dies."""
-        return self._threads.submit(self._do, (fn, args, kwargs))
+        return self._threads.submit(self._do, fn, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
@@ -317,11 +317,11 @@ class OwnWorkers(Executor):
         for process in list(self._processes):
             self._end(process)
 
-    def _do(self, task: object) -> Any:
+    def _do(self, fn: Callable[..., T], args: tuple[object, ...], kwargs: object) -> T:
         process = getattr(self._mine, "process", None) or self._start()
         pipe = self._processes[process]
         try:
-            pipe.send(task)
+            pipe.send((fn, args, kwargs))
             error, result = pipe.recv()
         except (EOFError, OSError):
             self._mine.process = None
@@ -383,10 +383,10 @@ def _starting() -> Iterator[None]:
     """
     from multiprocessing import resource_tracker, util
 
-    module: Any = util
+    names, key = vars(util), "_args_from_interpreter_flags"
     with _TURN:
-        usual = module._args_from_interpreter_flags
-        module._args_from_interpreter_flags = lambda: ["-I", *usual()]
+        usual = names[key]
+        names[key] = lambda: ["-I", *usual()]
         masked = getattr(signal, "pthread_sigmask", None)  # not on Windows
         if masked:
             # Start the resource tracker first. If it were started together with a process, it would
@@ -396,7 +396,7 @@ def _starting() -> Iterator[None]:
         try:
             yield
         finally:
-            module._args_from_interpreter_flags = usual
+            names[key] = usual
             if masked:
                 masked(signal.SIG_SETMASK, before)
 

@@ -208,9 +208,11 @@ def sweep(
     return batch
 
 
-def planned_bytes(robot: Robot, count: int, **options: Any) -> int:
+def planned_bytes(
+    robot: Robot, count: int, *, at_rest: bool, frame: Frame | None, reference: pin.SE3 | None
+) -> int:
     """Return the size [bytes] of a sweep's result over `count` points; see `ChunkJob`."""
-    return count * ChunkJob(robot, moving=False, **options).row_bytes
+    return count * ChunkJob(robot, at_rest=at_rest, frame=frame, reference=reference).row_bytes
 
 
 class ChunkJob:
@@ -220,11 +222,19 @@ class ChunkJob:
     """
 
     def __init__(
-        self, robot: Robot, *, at_rest: bool, engine: str | None = None, **options: Any
+        self,
+        robot: Robot,
+        *,
+        at_rest: bool,
+        engine: str | None = None,
+        frame: Frame | None = None,
+        reference: pin.SE3 | None = None,
+        moving: bool = False,
     ) -> None:
+        options: Any = {"frame": frame, "reference": reference, "moving": moving}
         self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
-        self._engine = checked_engine(engine)
         self.linearizer = Linearizer(robot, **options)
+        self._engine = checked_engine(engine)
         prepared = self.linearizer.prepared
         if engine == "compiled":
             if prepared.sensing is not None:
@@ -248,7 +258,7 @@ class ChunkJob:
                 self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         self.row_bytes = 8 * (robot.nq + sum(map(math.prod, self.shapes.values())))
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         # Only the arguments are pickled, because each worker needs its own work space.
         return self._again, ()
 
@@ -369,7 +379,7 @@ class SweepTask:
         if v is not None:
             self._known["v"] = checked_velocities(self.robot, v, self.count)
         if u is not None:
-            self._known["u0"] = checked_inputs(prepared.actuation.names, u, self.count)
+            self._known["u0"] = checked_inputs(len(prepared.actuation.names), u, self.count)
         # The known arrays that vary between points, and the shapes per point of all that do.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
         if isinstance(configurations, GivenConfigurations):

@@ -51,7 +51,7 @@ class Bound(NamedTuple):
     name: str
     sign: str
     limit: float
-    met: Any
+    met: Mask
 
 
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
@@ -220,7 +220,7 @@ class Campaign(FrozenArrays):
         of, rest = (of, rest) if of in ("worst", "settle", "drawn") else ("final", name)
         states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
-        groups: list[tuple[Any, Any, Array]] = {
+        groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
             "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
             "worst": [
                 (*kinds, self._beyond(self.largest)),
@@ -402,7 +402,10 @@ class Campaign(FrozenArrays):
 
     @classmethod
     def of(
-        cls, arrays: Mapping[str, Array], header: Mapping[str, Any], job: CampaignJob | None = None
+        cls,
+        arrays: Mapping[str, Array],
+        header: Mapping[str, object],
+        job: CampaignJob | None = None,
     ) -> Campaign:
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
@@ -410,7 +413,8 @@ class Campaign(FrozenArrays):
             key: arrays[key] if run.all() else arrays[key][run] for key in ARRAYS
         }
         for key in _HEADER:
-            values[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
+            value = header[key]
+            values[key] = tuple(value) if isinstance(value, list) else value
         return cls(**values, _job=job)
 
 

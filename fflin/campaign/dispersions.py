@@ -6,36 +6,40 @@ import zlib
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
-from fflin.base.names import by_name, input_keys
+from fflin.base.names import by_name, group_of, input_keys
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
-from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
-from fflin.campaign.spreads import SEED, deviation_of, inverse_of, is_closed_form, whole_number
+from fflin.campaign.pointing import columns_of, in_lanes, misaligned
+from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import Tree, loads_of
+from fflin.kernel.tree import Tree
+from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
+from fflin.robot.inputs import JointTorque
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import Piece, bodies_named, varied, with_changed
+from fflin.robot.mass_properties import bodies_named, varied, with_changed
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
-from fflin.simulation.plant import Plant
+from fflin.simulation.run import Plant
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
-_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz", "density": " "}  # {property: axes}
-_AXES = _OF_BODIES | {"misalignment": "12"}
+# Axes of the kinds of dispersions that have a value for each axis.
+_AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
+_OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
 _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
@@ -46,15 +50,16 @@ class Column(NamedTuple):
 
     name: str
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
-    at: tuple[tuple[int, int], ...]  # (index of state, body, joint, .., axis)
-    inverse: Callable[[Array], Array]  # inverse distribution function
+    at: list[int]  # indices of the states, bodies, joints, ...
+    axis: int
+    inverse: Inverse
 
 
 class Bound(NamedTuple):
     """Function that creates a policy for a robot, and the linear model of its design, if any."""
 
     bind: Callable[[Robot], Policy]
-    lin: Any = None
+    lin: LinearModel | None = None
 
 
 class Dispersions:
@@ -65,33 +70,33 @@ class Dispersions:
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
-        self._model = plant.robot._bare.model
-        self._sensors: tuple[str, ...] = ()
-        self._senses_states = isinstance(reads := decider(policy), StateFeedback)
+        robot, reads = plant.robot, decider(policy)
+        self._model = robot._bare.model
+        self._senses_states, sensors = isinstance(reads, StateFeedback), tuple[str, ...]()
         if isinstance(reads, StateFeedback | LinearController):
-            lin = reads.lin
-            self._sensors = lin.state_names if self._senses_states else lin.output_names
+            sensors = reads.lin.state_names if self._senses_states else reads.lin.output_names
         if isinstance(reads, TrajectoryOutputFeedback):
-            self._sensors = reads.filter.output_names
-        known = {
+            sensors = reads.filter.output_names
+        # Names of the quantities of each kind.
+        self._known: dict[str, tuple[str, ...]] = {
             "state": plant.state.names,
-            **dict.fromkeys(_OF_SENSORS, self._sensors),
-            **dict.fromkeys(_OF_BODIES, tuple(plant.robot.pieces)),
+            **dict.fromkeys(_OF_SENSORS, sensors),
+            **dict.fromkeys(_OF_BODIES, tuple(robot.pieces)),
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
-            **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
+            **dict.fromkeys(_OF_SPRINGS, robot.joint_names),
         }
-        modes = tuple(each.name for each in plant.robot.modes)
+        modes = tuple(each.name for each in robot.modes)
         if modes:
-            known["frequency"] = modes
+            self._known["frequency"] = modes
+        kinds = [*self._known][1:]
+        self._known |= {"delay": ("delay",), "seed": (SEED,), "frequency": modes}
         # Indices of the joints of the modes, in the order of the names.
-        self._modes = [plant.robot.joint_names.index(name) for name in modes]
-        by_kind: dict[str, dict[str, object]] = {}
-        self.columns: list[Column] = []
+        self._modes = [robot.joint_names.index(name) for name in modes]
+        by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
-            kind, head = (kind, head) if kind in known and head else ("state", str(key))
-            if key == "delay":
-                kind, known["delay"] = "delay", ("delay",)
+            if kind not in kinds or not head:
+                head, kind = str(key), "delay" if key == "delay" else "state"
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
@@ -99,33 +104,37 @@ class Dispersions:
                     "another description; give (least, largest) in s, a list of times in s or a "
                     "distribution"
                 )
-            inverse = deviation_of if kind == "noise" else inverse_of
-            spreads = by_kind.setdefault(kind, {})
-            spreads[head] = inverse(str(key), own), str(key) if tied else ""
-        if "noise" in by_kind:
-            self.columns.append(Column(SEED, "seed", ((0, 0),), whole_number))
-        for kind, spreads in by_kind.items():
-            self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
-        if not self.columns:
+            inverse = inverse_of(str(key), own, fixed=kind == "noise")
+            by_kind.setdefault(kind, {})[head] = inverse, str(key) if tied else ""
+        if not by_kind:
             raise InputError(
                 "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
             )
-        self._kinds = {column.kind for column in self.columns}
+        self._kinds = {*by_kind}
+        self.columns: list[Column] = []
+        if "noise" in by_kind:
+            self.columns.append(Column(SEED, "seed", [0], 0, SEEDS))
+        for kind, spreads in by_kind.items():
+            self._add(kind, spreads, " | ".join(kinds))
+        # Names of the dispersed values.
+        self.names = tuple(column.name for column in self.columns)
         # Drawn values of slow distributions, by name and block.
         self._kept: dict[tuple[str, int], Array] = {}
-        self._refuse_same_mass()
-
-    def _refuse_same_mass(self) -> None:
-        """Raise an error if a link's mass is dispersed twice, directly or as part of a body."""
-        pieces = [*self._plant.robot.pieces.values()]
-        masses = [*self._changed("mass"), *self._changed("density")]
-        for (column, at), (other, of) in combinations(masses, 2):
+        # The mass of a link must not be dispersed twice, directly or as part of a body.
+        pieces = [*robot.pieces.values()]
+        masses = list[tuple[str, int]]()
+        for kind in ("mass", "density"):
+            masses += ((x.name, at) for x in self.columns if x.kind == kind for at in x.at)
+        for (name, at), (other, of) in combinations(masses, 2):
             one, two = pieces[at], pieces[of]
             if at == of or (one.joint == two.joint and (one.whole or two.whole)):
-                names = f"'{self.names[column]}' and '{self.names[other]}'"
-                raise InputError(f"{names} disperse the same mass; disperse only one of them")
+                raise InputError(
+                    f"'{name}' and '{other}' disperse the same mass; disperse only one of them"
+                )
 
-    def _add(self, kind: str, spreads: Mapping[str, Any], names: list[str], kinds: str) -> None:
+    def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
+        """Add the columns of a kind from {name: (inverse distribution function, tie or "")}."""
+        robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
@@ -137,62 +146,61 @@ class Dispersions:
                 f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
                 "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
             )
-        label = dict(zip(names, names, strict=True))
+        written = dict[str, str]()
         try:
             if kind in _OF_BODIES:
                 spreads, written = self._by_piece(kind, spreads)
-                label |= written
             found = by_name(f"{kind} to disperse", spreads, names)
         except UnknownNameError as error:
             raise UnknownNameError(
                 f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
             ) from None
-        draws: dict[str, tuple[Any, list[int]]] = {}
+        nominal = robot.springs
+        factors = {
+            **nominal._asdict(),
+            "frequency": nominal.stiffness[self._modes],
+        }.get(kind)
+        draws: dict[str, tuple[Inverse, list[int]]] = {}
         for at, (inverse, tied) in sorted(found.items()):
-            own = names[at] if kind in ("state", "delay") else f"{label[names[at]]}.{kind}"
-            nominal = self._plant.robot.springs
-            of_spring = kind in _OF_SPRINGS and not getattr(nominal, kind)[at]
-            if of_spring or (kind == "frequency" and not nominal.stiffness[self._modes[at]]):
+            own = names[at]
+            if kind not in ("state", "delay"):
+                own = f"{written.get(own, own)}.{kind}"
+            if factors is not None and not factors[at]:
                 raise InputError(
                     f"'{own}' is dispersed by a factor, but its nominal value is 0; remove the "
                     "dispersion, or give the robot a nonzero value"
                 )
-            if kind == "misalignment":
-                require_direction(self._plant.robot, at)
+            if kind == "misalignment" and group_of(names[at]) == JointTorque.GROUP:
+                raise InputError(
+                    f"'{own}' is dispersed, but the motor of a joint cannot be misaligned with the "
+                    "joint; only thrusters, wheels, tau_b and F_b can be misaligned"
+                )
             draws.setdefault(tied or own, (inverse, []))[1].append(at)
         for own, (inverse, targets) in draws.items():
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{own}.{letter}".rstrip(". ")
-                where = tuple((at, axis) for at in targets)
-                self.columns.append(Column(name, kind, where, inverse))
+                self.columns.append(Column(name, kind, targets, axis, inverse))
 
     def _by_piece(
-        self, kind: str, spreads: Mapping[str, object]
-    ) -> tuple[dict[str, Any], dict[str, str]]:
+        self, kind: str, spreads: Mapping[str, tuple[Inverse, str]]
+    ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: key} for keys without a wildcard."""
-        robot, found, named = self._plant.robot, dict[str, object](), dict[str, str]()
+        robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
-        for key in sorted(spreads, key=lambda key: key in alone):  # names override patterns
+        for key in sorted(spreads, key=alone.__contains__):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
                         f"'{named[name]}' and '{key}' are the same link; give its {kind} only once"
                     )
                 found[name] = spreads[key]
-                named |= {name: key} if key in alone else {}
+                if key in alone:
+                    named[name] = key
         whole = {robot.pieces[name].joint for name in named if robot.pieces[name].whole}
-        links = {name for name in found if robot.pieces[name].joint in whole}
-        return {name: x for name, x in found.items() if name in named or name not in links}, named
-
-    def _changed(self, *kinds: str) -> list[tuple[int, int]]:
-        """Return (column, index of a state, body, joint, ..) for each quantity of these kinds."""
-        columns = enumerate(self.columns)
-        return [(i, at) for i, each in columns if each.kind in kinds for at, _ in each.at]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the dispersed values."""
-        return tuple(column.name for column in self.columns)
+        for name in found.keys() - named:
+            if robot.pieces[name].joint in whole:
+                del found[name]
+        return found, named
 
     def drawn(self, start: int, stop: int) -> Array:
         """Return the values (N, k) of runs start to stop - 1.
@@ -207,19 +215,16 @@ class Dispersions:
                 drawn[low - start : high - start, at] = values[low - first : high - first]
         return drawn
 
-    def _uniform(self, column: Column, block: int) -> Array:
-        key = (self._seed, zlib.crc32(column.name.encode()))
-        stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-        # The inverse may be infinite at 0 and 1, so the values are kept between them.
-        return np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-
     def _drawn(self, column: Column, block: int, count: int) -> Array:
         """Return the first `count` values of a block of runs.
 
         Values of slow distributions are kept for later calls.
         """
-        uniform = self._uniform(column, block)
-        if is_closed_form(column.inverse):
+        key = (self._seed, zlib.crc32(column.name.encode()))
+        stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
+        # The inverse may be infinite at 0 and 1, so the values are kept between them.
+        uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
+        if isinstance(column.inverse, partial):  # a closed form of `spreads`
             return column.inverse(uniform)
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
@@ -248,105 +253,78 @@ class Dispersions:
                         f"for which no valid robot exists; expected{bound}. Use a smaller standard "
                         "deviation, or a uniform distribution (least, largest)"
                     )
+            said = f"an invalid initial attitude is drawn in the runs from {start} on"
             try:
                 self.starts(drawn)
-            except ChartError as error:
-                said = f"an invalid initial attitude is drawn in the runs from {start} on"
+                # A drawn inertia may be too small for the flexible modes of its body.
+                if appendages := self._plant.robot.appendages:
+                    refused = first_impossible(self._model, appendages, self.bodies(drawn))
+                    if refused is not None:
+                        said = f"run {start + refused} draws an invalid mass or inertia"
+                        self.one(drawn[refused])
+            except (ChartError, InputError) as error:
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
-            if not (appendages := self._plant.robot.appendages):
-                continue
-            # A drawn inertia may be too small for the flexible modes of its body.
-            refused = first_impossible(self._model, appendages, self.bodies(drawn))
-            if refused is not None:
-                try:
-                    self.one(drawn[refused])
-                except InputError as error:
-                    said = f"run {start + refused} draws an invalid mass or inertia"
-                    raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
-    def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
-        """Return the drawn values (N, size, axes) of a kind, or zeros if it is not dispersed."""
-        found = np.zeros((len(drawn), size, axes))
+    def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
+        """Return the drawn values (N, size) or (N, size, axes) of a kind, `rest` if not drawn."""
+        axes = len(_AXES.get(kind, " "))
+        found = np.full((len(drawn), len(self._known[kind]), axes), rest)
         for values, column in zip(drawn.T, self.columns, strict=True):
-            for at in column.at if column.kind == kind else ():
-                found[(slice(None), *at)] = values
-        return found
+            if column.kind == kind:
+                found[:, column.at, column.axis] = values[:, None]
+        return found if axes > 1 else found[..., 0]
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
         """Return the initial configurations (N, nq) and velocities (N, nv)."""
-        x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
-        return self._plant.state.points(x)[1:]
+        return self._plant.state.points(self._x0 + self._of("state", drawn))[1:]
 
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of the dispersed bodies."""
         robot, model = self._plant.robot, self._model
-        pieces = [*robot.pieces.values()]
-        mass, com, inertia, density = (
-            self._of(kind, drawn, len(pieces), len(axes)) for kind, axes in _OF_BODIES.items()
-        )
-        changed: dict[int, list[tuple[Piece, tuple[Array, Array, Array]]]] = {}
-        for at in sorted({at for _, at in self._changed(*_OF_BODIES)}):
+        pieces, changed = [*robot.pieces.values()], dict[int, list[Array]]()
+        mass, com, inertia, density = (self._of(kind, drawn) for kind in _OF_BODIES)
+        dispersed = {at for each in self.columns if each.kind in _OF_BODIES for at in each.at}
+        for at in sorted(dispersed):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
-            properties = varied(
-                pieces[at],
-                mass=mass[:, at, 0],
-                density=density[:, at, 0],
-                com=com[:, at],
-                inertia=inertia[:, at],
-            )
-            changed.setdefault(own, []).append((pieces[at], properties))
+            changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
+            changed.setdefault(own, []).append(varied(pieces[at], *changes))
         return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
 
-    def _springs(self, kind: str, drawn: Array) -> Array:
-        robot = self._plant.robot
-        factor: Array = 1.0 + self._of(kind, drawn, robot.n)[..., 0]
+    def _springs(self, drawn: Array) -> dict[str, Array]:
+        """Return the stiffness and the damping (N, n) of all joints, each if it is dispersed."""
+        found = dict[str, Array]()
         # If the frequency of a mode changes, its damping ratio stays the same.
-        frequency = 1.0 + self._of("frequency", drawn, len(self._modes))[..., 0]
-        factor[:, self._modes] *= frequency ** (2 if kind == "stiffness" else 1)
-        return factor * getattr(robot.springs, kind)
-
-    @property
-    def _springs_of(self) -> tuple[str, ...]:
-        """Names of the dispersed properties: stiffness, damping, both or neither."""
-        if "frequency" in self._kinds:
-            return _OF_SPRINGS
-        return tuple(kind for kind in _OF_SPRINGS if kind in self._kinds)
+        frequency = 1.0 + self._of("frequency", drawn)
+        for kind, power in zip(_OF_SPRINGS, (2, 1), strict=True):
+            if self._kinds & {kind, "frequency"}:
+                factor = 1.0 + self._of(kind, drawn)
+                factor[:, self._modes] *= frequency**power
+                found[kind] = factor * getattr(self._plant.robot.springs, kind)
+        return found
 
     def _faults(self, drawn: Array) -> ActuatorFaults | None:
         """Return the faults of the inputs in each run (N,), or None if no fault is dispersed."""
         if not self._kinds & {*_OF_INPUTS, "misalignment"}:
             return None
-        gain, bias, until = (
-            self._of(kind, drawn, len(self._plant.faults.gain))[..., 0] for kind in _OF_INPUTS
-        )
-        safe = np.ones(until.shape[1], dtype=bool)
-        safe[[at for _, at in self._changed("fails")]] = False
-        until[:, safe] = np.inf
-        turn = columns_of(self._plant.robot, self._angles(drawn))
+        gain, bias = self._of("gain", drawn), self._of("bias", drawn)
+        until, angles = self._of("fails", drawn, np.inf), self._of("misalignment", drawn)
+        turn = columns_of(self._plant.robot, angles)
         return ActuatorFaults(1.0 + gain, bias, until, turn)
-
-    def _angles(self, drawn: Array) -> Array:
-        return self._of("misalignment", drawn, len(self._plant.faults.gain), 2)
-
-    def _sensing(self, drawn: Array) -> tuple[Array, Array, Array]:
-        """Return bias and deviation (N, ny) of the sensors, and the seed (N,) of their noise."""
-        bias, noise = (self._of(key, drawn, len(self._sensors))[..., 0] for key in _OF_SENSORS)
-        return bias, noise, self._of("seed", drawn, 1)[:, 0, 0]
 
     def delays(self, drawn: Array) -> Array:
         """Return the delays (N,) in integration steps."""
-        late = self._of("delay", drawn, 1)[:, 0, 0] / self._times.dt
+        late = self._of("delay", drawn)[:, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
         """Return the arrays of the compiled loop that vary between runs."""
-        plant, (q, v) = self._plant, self.starts(drawn)
-        runs = {"q": q, "nu": plant.state.velocities(v)}
+        plant, (q, v), count = self._plant, self.starts(drawn), len(drawn)
+        runs = {"q": q, "nu": plant.state.velocities(v), **self._springs(drawn)}
         if faults := self._faults(drawn):
             runs |= faults._asdict()
         if self._kinds & {*_OF_BODIES}:
-            parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
+            parameters = np.tile(tree.bodies.reshape(1, -1, 10), (count, 1, 1))
             for at, body in self.bodies(drawn).items():
                 # In the tree, wheels are numbered together with the joints.
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
@@ -355,71 +333,75 @@ class Dispersions:
                 # Only the change of the body is added, because its parameters also contain its
                 # wheels.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
-            runs["bodies"] = parameters.reshape(len(drawn), -1)
-        runs |= {kind: self._springs(kind, drawn) for kind in self._springs_of}
+            runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
-            loads = loads_of(plant.robot, plant.actuation, tree)
-            turned = in_lanes(plant.robot, tree, loads, self._angles(drawn))
+            turned = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
             turned["bodies"] += runs.get("bodies", tree.bodies)
             runs |= turned
         if self._kinds & {*_OF_SENSORS}:
-            names = plant.state.names if self._senses_states else self._sensors
-            fed = [names.index(name) for name in self._sensors]
-            *errors, seed = self._sensing(drawn)
-            for key, values in zip(("sensed", "noise"), errors, strict=True):
-                runs[key] = np.zeros((len(drawn), len(names)))
-                runs[key][:, fed] = values
+            sensors = self._known["sensor"]
+            names = plant.state.names if self._senses_states else sensors
+            fed = [names.index(name) for name in sensors]
+            for key, kind in (("sensed", "sensor"), ("noise", "noise")):
+                runs[key] = np.zeros((count, len(names)))
+                runs[key][:, fed] = self._of(kind, drawn)
             if "noise" in self._kinds:
-                runs["seed"] = seed
+                runs["seed"] = self._of("seed", drawn)[:, 0]
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)[:, None]
         return runs
 
-    def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
+    def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
         """Return a run's robot with its inputs, its policy, and its initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
-        bodies = {
-            joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
-            for joint, (mass, com, inertia) in self.bodies(rows).items()
-        }
-        robot = robot.with_bodies(bodies) if bodies else robot
-        for kind in self._springs_of:
-            values = self._springs(kind, rows)[0].tolist()
-            of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
-            robot = replace(robot, **of)
+        bodies = self.bodies(rows)
+        if bodies:
+            robot = robot.with_bodies(
+                {
+                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
+                    for joint, (mass, com, inertia) in bodies.items()
+                }
+            )
+        springs = {"stiffness": robot.stiffness, "damping": robot.damping}
+        for kind, values in self._springs(rows).items():
+            springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))
+        robot = replace(robot, stiffness=springs["stiffness"], damping=springs["damping"])
         if self._kinds & {*_OF_SENSORS}:
-            policy = _with_sensor_errors(policy, *(each[0] for each in self._sensing(rows)))
+            errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
+            policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
-            robot = misaligned(robot, self._angles(rows)[0])
+            robot = misaligned(robot, self._of("misalignment", rows)[0])
             if isinstance(policy, Allocation):  # allocates to the nominal directions
-                given = policy
-                policy = Bound(lambda _: bound(given, plant.robot))
+                nominal = bound(policy, plant.robot)
+                policy = Bound(lambda _: nominal)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
         own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
         return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 
-def _with_sensor_errors(policy: Any, bias: Array, deviation: Array, seed: float) -> Any:
+def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
     """Return a policy whose states or outputs (ny,) have these measurement errors."""
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
-    generator, given = noise_generator(seed), getattr(policy, "noise", None)
+    generator, given = noise_generator(seed[0]), getattr(policy, "noise", None)
 
     def error(t: float) -> Array:
         found: Array = bias + deviation * generator.standard_normal(len(bias))
         return found if given is None else found + np.asarray(given(t))
 
+    if not isinstance(policy, StateFeedback):
+        noisy = copy(policy)
+        vars(noisy)["noise"] = error
+        return noisy
+    K = policy.K
+
     def bind(robot: Robot) -> Policy:
         inner = bound(policy, robot)
-        return lambda t, q, v: np.asarray(inner(t, q, v)) - policy.K @ error(t)
+        return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ error(t)
 
-    if isinstance(policy, StateFeedback):
-        return Bound(bind, policy.lin)
-    noisy = copy(policy)
-    noisy.noise = error
-    return noisy
+    return Bound(bind, policy.lin)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -35,10 +35,13 @@ from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.dynamics.coordinates import moved_by, moving_error
-from fflin.dynamics.points import point_of
+from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
@@ -139,25 +142,23 @@ class Funnel(Design):
     frame: str
 
     @cached_property
-    def _counts(self) -> tuple[Array, Array, Array]:
-        counts = [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
-        inside, bounds, intervals = map(np.array, zip(*counts, strict=True))
-        return inside, bounds, intervals
+    def _counts(self) -> list[tuple[int, float, tuple[float, float]]]:
+        return [until_failure(row != 0.0, self.confidence) for row in self.outcomes]
 
     @property
     def inside(self) -> Array:
         """Number of runs (m,) that start at or below the level `rho`."""
-        return self._counts[0]
+        return np.array([inside for inside, _, _ in self._counts])
 
     @property
     def inside_rate(self) -> Array:
         """Lower bound (m,) on the success rate of runs that start at or below the level `rho`."""
-        return self._counts[1]
+        return np.array([bound for _, bound, _ in self._counts])
 
     @property
     def rate(self) -> Array:
         """Clopper-Pearson interval (m, 2) of the success rate of all runs."""
-        return self._counts[2]
+        return np.array([interval for _, _, interval in self._counts])
 
     @cached_property
     def rho(self) -> Array:
@@ -213,7 +214,14 @@ class Funnel(Design):
         size = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
-    def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
+    def contains(
+        self,
+        t: float,
+        x: ArrayLike | None = None,
+        *,
+        q: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+    ) -> bool:
         """Return whether a state is inside the funnel at time t.
 
         Parameters
@@ -229,7 +237,7 @@ class Funnel(Design):
         rho, state = self.level(t), StateMap(self.robot, frame="local")
         if x is None and q is None:
             raise InputError("no state is given; give x, or q and v")
-        q, v = point_of(state, x, q, v, lambda: (q, v))
+        q, v = point_of(state, x, q, v, partial(start_of, self.robot))
         e = moving_error(state, *self.trajectory.point(t)[:2], q, v)
         return bool(e @ self.cost(t) @ e <= rho)
 
@@ -359,9 +367,8 @@ def funnel(
     2
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
-    instance("schedule", feedback, TrajectoryFeedback, expected)
+    feedback = instance("schedule", followed(schedule, robot), TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
@@ -377,15 +384,7 @@ def funnel(
     with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            axes = ellipsoid_axes(by.P[first])
-            drawn = partial(_starts, job.x0, by.P[first], axes, rng)
-
-            def simulate(roots: Array, job: CampaignJob = job, drawn: Any = drawn) -> Array:
-                return completed(job, drawn(roots), how)["outcome"]
-
-            root = _largest_root(simulate, _widest(axes, robot))
-            tried[knot] = root**2
-            outcomes[knot] = simulate(root * (np.arange(samples) + 0.5) / samples)
+            tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
             if progress:
                 progress(knot + 1, len(jobs))
     return Funnel(
@@ -424,15 +423,40 @@ def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
     return beyond
 
 
-def _starts(center: Array, P: Array, axes: Array, rng: np.random.Generator, roots: Array) -> Array:
-    """Return random initial deviations e (N, nx) from `center` with sqrt(e' P e) equal to `roots`.
+def _tested(
+    job: CampaignJob, P: Array, samples: int, rng: np.random.Generator, how: Execution
+) -> tuple[float, Array]:
+    """Return the largest level tested at a knot, and the outcomes (samples,) up to this level.
 
-    P (nx, nx) is the matrix of the level, and `axes` are its `ellipsoid_axes`.
+    About one run in 16 fails at the largest level. P (nx, nx) is the matrix of the level.
     """
-    e = rng.normal(size=(len(roots), len(P))) @ axes.T
-    # Directions in which P is zero do not contribute to the level.
-    e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
-    return moved_by("local", np.tile(center, (len(e), 1)), e) - center
+    W, joints = ellipsoid_axes(P), job.plant.robot.joints
+
+    def simulate(roots: Array) -> Array:
+        """Return the outcomes of runs from random errors e (N, nx) with sqrt(e' P e) = roots."""
+        e = rng.normal(size=(len(roots), len(P))) @ W.T
+        # Directions in which P is zero do not contribute to the level.
+        e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
+        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
+        return completed(job, starts - job.x0, how)["outcome"]
+
+    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
+    reach = [
+        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
+        np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
+        *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
+    ]
+    # `root` is the square root of a level; at `widest`, a start has one of the largest errors.
+    root = widest = float(1.0 / max(reach))
+    # If the goal is missed even without an error, the widest level is tested.
+    if not simulate(np.zeros(1)).any():
+        for _ in range(_HALVINGS):
+            if not simulate(np.full(_PILOTS, root)).any():
+                break
+            root /= 2.0
+        further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
+        root = min(root * (2.0 if further else 1.4), widest)
+    return root**2, simulate(root * (np.arange(samples) + 0.5) / samples)
 
 
 def runs_from(
@@ -441,7 +465,7 @@ def runs_from(
     k: int,
     first: int,
     engine: str | None,
-    options: Mapping[str, Any],
+    options: Mapping[str, object],
     judge: Judge | None = None,
 ) -> CampaignJob:
     """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
@@ -457,20 +481,7 @@ def runs_from(
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
-def _largest_root(simulate: Callable[[Array], Array], widest: float) -> float:
-    """Return the square root of the largest level to test; about one run in 16 fails there."""
-    root = widest
-    if simulate(np.zeros(1)).any():
-        return root  # the goal is missed even without an error
-    for _ in range(_HALVINGS):
-        if not simulate(np.full(_PILOTS, root)).any():
-            break
-        root /= 2.0
-    further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
-    return min(root * (2.0 if further else 1.4), widest)
-
-
-def _bounds(name: str, given: Any, kinds: Collection[str]) -> dict[str, float]:
+def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
     """Return {kind: largest error} from a given mapping, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
@@ -486,7 +497,9 @@ def _shown(bounds: Mapping[str, float]) -> str:
     return ", ".join(f"{key} up to {bound:g} {KINDS[key]}" for key, bound in bounds.items())
 
 
-def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int, int]]:
+def _indices(
+    motion: Trajectory, by: GainSchedule, knots: int | Sequence[float]
+) -> list[tuple[int, int]]:
     """Return the indices of the chosen knots in the trajectory and in the schedule."""
     t, own = motion.t - motion.t[0], by.t - by.t[0]
     at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)
@@ -506,14 +519,3 @@ def _indices(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int
     if not len(chosen):
         raise InputError("knots is empty; give the number of knots, or a list of times [s]")
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]
-
-
-def _widest(W: Array, robot: Robot) -> float:
-    """Return the square root of the largest level that keeps a start within its largest errors."""
-    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in robot.joints]
-    reach = [
-        np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
-        np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
-        *np.linalg.norm(W[6 : 6 + robot.n], axis=1) / np.array(largest),
-    ]
-    return float(1.0 / max(reach))

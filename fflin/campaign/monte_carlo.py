@@ -10,7 +10,6 @@ from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -50,7 +49,7 @@ _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
 def monte_carlo(
     robot: Robot,
     policy: object,
-    dispersions: Mapping[str, Any],
+    dispersions: Mapping[str, object],
     *,
     runs: int,
     duration: float | None = None,
@@ -219,15 +218,15 @@ def monte_carlo(
     if how.executor:
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
-    header["goals"] = _goals(goals, until, shapes, header)
+    header["goals"] = wanted = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
     request = ""
     if path:
-        request = _request(job, header)
+        request = _request(job, runs, header)
         earlier = None if truth("overwrite", overwrite) else _earlier(path, request)
         if earlier and until is None and len(earlier) == runs:
-            return replace(earlier, goals=header["goals"], confidence=confidence, _job=job)
+            return replace(earlier, goals=wanted, confidence=confidence, _job=job)
         if store is None:
             texts = {"header": json.dumps(header), "constant": "[]"}
             store = FileStore(path, request, runs, size, shapes, {}, texts)
@@ -272,7 +271,10 @@ def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
 
 
 def _goals(
-    given: object, until: str | None, shapes: Mapping[str, tuple[int, ...]], header: dict[str, Any]
+    given: object,
+    until: str | None,
+    shapes: Mapping[str, tuple[int, ...]],
+    header: Mapping[str, object],
 ) -> tuple[str, ...]:
     """Return the goals; raise an error for an invalid goal before any run begins."""
     listed = [given] if isinstance(given, str) else given
@@ -280,7 +282,7 @@ def _goals(
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
         *([] if until is None else [until]),
     ]
-    none = Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": ()})
+    none = Campaign.of(MemoryStore(1, 1, shapes).arrays, {**header, "goals": ()})
     for goal in goals:
         none.met(instance("a goal", goal, str, "a text such as 'attitude < 1 deg'"))
     return tuple(dict.fromkeys(goals))
@@ -309,7 +311,7 @@ def _require_sendable(job: CampaignJob) -> None:
         ) from None
 
 
-def _header(job: CampaignJob) -> dict[str, Any]:
+def _header(job: CampaignJob) -> dict[str, object]:
     """Return the header of a campaign: everything that is not an array."""
     plan, plant = job.plan, job.plant
     robot = plant.robot
@@ -335,9 +337,9 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     }
 
 
-def _request(job: CampaignJob, header: dict[str, Any]) -> str:
+def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
     """Return a digest of everything on which the result depends."""
-    drawn = job.dispersions.drawn(0, min(header["asked"], _STAGE))
+    drawn = job.dispersions.drawn(0, min(runs, _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))
     return content_digest({"call": call, "drawn": drawn, "first": job.digest(drawn[:1])})

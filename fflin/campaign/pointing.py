@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Loads, Tree
+from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.equipment.mounting import turned_to
-from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.inputs import Input, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
-
-_ALONG: dict[type, str] = {Thruster: "direction", ReactionWheel: "axis"}
 
 
 def turned(direction: object, angles: Array) -> Array:
@@ -27,17 +23,6 @@ def turned(direction: object, angles: Array) -> Array:
     side = angles[:, 1:] * first - angles[:, :1] * second
     found: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
     return found
-
-
-def require_direction(robot: Robot, at: int) -> None:
-    """Raise `InputError` if an input cannot be misaligned."""
-    for item, names, first in _indexed(robot):
-        if first <= at < first + len(names) and isinstance(item, JointTorque):
-            raise InputError(
-                f"'{names[0]}.misalignment' is dispersed, but the motor of a joint cannot be "
-                "misaligned with the joint; only thrusters, wheels, tau_b and F_b can be "
-                "misaligned"
-            )
 
 
 def columns_of(robot: Robot, angles: Array) -> Array:
@@ -51,48 +36,57 @@ def columns_of(robot: Robot, angles: Array) -> Array:
 
 def misaligned(robot: Robot, angles: Array) -> Robot:
     """Return a robot whose thrusters and wheels are rotated by angles (nu, 2)."""
-    inputs = []
+    inputs = list[Input]()
     for item, _, at in _indexed(robot):
-        key = _ALONG.get(type(item))
-        other = {key: turned(getattr(item, key), angles[at : at + 1])[0]} if key else {}
-        inputs.append(replace(item, **other) if key else item)
+        if isinstance(item, Thruster | ReactionWheel):
+            inputs.append(_pointed(item, turned(_direction(item), angles[at : at + 1])[0]))
+        else:
+            inputs.append(item)
     return robot.replace(inputs=inputs)
 
 
-def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
+def in_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
-    wrench = np.tile(loads.wrench, (count, 1)).reshape(count, -1, 6)
-    stored = np.tile(loads.stored, (count, 1)).reshape(count, -1, 3)
+    wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
+    stored = np.tile(tree.stored, (count, 1)).reshape(count, -1, 3)
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
     bodies = np.zeros((count, tree.bodies.size // 10, 10))
-    inputs, storing = loads.input.tolist(), loads.stored_body.tolist()
+    inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
     for item, own, at in _indexed(robot):
-        if not (key := _ALONG.get(type(item))):
+        if not isinstance(item, Thruster | ReactionWheel):
             continue
-        any_item: Any = item
-        joint, placement = find_frame(model, any_item.frame)
+        joint, placement = find_frame(model, item.frame)
         body = names.index(model.names[joint]) - ROOT
         axes = tree.axes[body].T @ placement.rotation
-        before, after = np.array(getattr(item, key)), turned(getattr(item, key), angles[:, at])
+        before, after = _direction(item), turned(_direction(item), angles[:, at])
         if at in inputs:
-            units = [replace(any_item, **{key: axis}).wrench for axis in np.eye(3)]
-            columns = np.column_stack([placement.act(pin.Force(unit)).vector for unit in units])
+            forces = [placement.act(pin.Force(_pointed(item, x).wrench)).vector for x in np.eye(3)]
+            columns = np.column_stack(forces)
             parts = [tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)]
             wrench[:, inputs.index(at)] += (after - before) @ np.concatenate(parts).T
-        if getattr(item, "momentum", 0.0):
-            change = any_item.momentum * (after - before) @ axes.T
-            stored[:, storing.index(body)] += change
-        if inertia := getattr(item, "inertia", None):
+        if isinstance(item, ReactionWheel) and item.momentum:
+            stored[:, storing.index(body)] += item.momentum * (after - before) @ axes.T
+        if isinstance(item, ReactionWheel) and item.inertia:
             wheel = names.index(own[0]) - ROOT
-            turns = [axes @ turned_to(each) for each in after]
-            fixed[:, wheel, :9] = np.array([turn.ravel("F") for turn in turns])
+            fixed[:, wheel, :9] = [(axes @ turned_to(each)).ravel("F") for each in after]
             a, b = after @ axes.T, axes @ before
             change = np.outer(b, b) - a[:, :, None] * a[:, None]
             row, column = np.triu_indices(3)
-            bodies[:, body, 4:] += inertia * change[:, row, column]
+            bodies[:, body, 4:] += item.inertia * change[:, row, column]
     of = {"wrench": wrench, "stored": stored, "fixed": fixed, "bodies": bodies}
     return {name: each.reshape(count, -1) for name, each in of.items()}
+
+
+def _direction(item: Thruster | ReactionWheel) -> Array:
+    return np.array(item.direction if isinstance(item, Thruster) else item.axis)
+
+
+def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | ReactionWheel:
+    """Return a thruster or wheel with another direction."""
+    if isinstance(item, Thruster):
+        return replace(item, direction=along.tolist())
+    return replace(item, axis=along.tolist())
 
 
 def _indexed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:

@@ -37,7 +37,7 @@ from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.packing import SLOTS, noise_of, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
-from fflin.simulation.run import Recording, go
+from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of
 
 _LARGEST_CHUNK = 256
@@ -58,11 +58,11 @@ class CampaignJob:
         given: object,
         seed: int,
         engine: str | None,
-        options: Mapping[str, Any],
+        options: Mapping[str, object],
         judge: Judge | None = None,
     ) -> None:
         self._again = partial(CampaignJob, robot, policy, given, seed, options=options, judge=judge)
-        settings = dict(options)
+        settings: dict[str, Any] = dict(options)
         # A judge compares errors with the errors at the start, so the histories contain the start.
         histories = settings.pop("histories", 0 if judge is None else 1)
         unlimited = settings.pop("unlimited", False)
@@ -134,8 +134,19 @@ class CampaignJob:
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
-        runs = self._in_lanes(first)
-        return content_digest({**_loop_arrays(self.plan), **runs, "target": self.target})
+        plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
+        found: dict[str, object] = {**self._in_lanes(first), "target": self.target}
+        if noise_of(plan):
+            last = min(plan.times.steps, SLOTS * plan.times.sample)
+            found["of sensors"] = noises(plan, len(loop.law.y), 0, last)[1]
+        left: list[object] = [loop]
+        while left:  # the arrays and numbers in nested tuples
+            value = left.pop()
+            if isinstance(value, tuple):
+                left.extend(value)
+            else:
+                found[f"loop.{len(found)}"] = value
+        return content_digest(found)
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
@@ -226,27 +237,6 @@ def _recorded(plan: Plan, every: int) -> Recording:
     if run.stopped.startswith("interrupted"):
         raise KeyboardInterrupt
     return run
-
-
-def _loop_arrays(plan: Plan) -> dict[str, object]:
-    """Return all arrays and numbers that the compiled loop reads for a plan, without compiling it.
-
-    Two plans with equal arrays have equal runs.
-    """
-    parts = packed(plan)
-    last = min(plan.times.steps, SLOTS * plan.times.sample)
-    samples = noises(plan, len(parts.law.y), 0, last)[1] if noise_of(plan) else np.zeros(0)
-    found: dict[str, object] = {"noise": samples}
-
-    def collect(name: str, value: object) -> None:
-        if isinstance(value, tuple):
-            for index, each in enumerate(value):
-                collect(f"{name}.{index}", each)
-        else:
-            found[name] = value
-
-    collect("loop", parts)
-    return found
 
 
 def expect(

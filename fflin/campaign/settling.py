@@ -10,11 +10,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
-from fflin.analysis.names import rate_of
+from fflin.analysis.mechanics import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
@@ -227,7 +226,7 @@ def settle(
     return arrays
 
 
-def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
+def checked_loop(robot: Robot, lin: LinearModel, gain: object) -> Loop:
     """Return the loop of a gain; raise `InputError` if it cannot settle at the operating point."""
     instance("robot", robot, Robot, "a fflin.Robot")
     instance("lin", lin, LinearModel, "a fflin.LinearModel")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.base.toml_file import TomlFile, is_number
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path
+
+Inverse: TypeAlias = Callable[[Array], Array]  # inverse distribution function
 
 SEED = "noise"  # name of the seed of noise among the drawn values; a seed has no correlation
 
@@ -26,7 +28,7 @@ _EXPECTED = (
 )
 
 
-class DispersionFile(dict[str, Any]):
+class DispersionFile(dict[str, object]):
     """{name, group or pattern: spread} from a file, with the file's line numbers."""
 
     def __init__(self, document: TomlFile) -> None:
@@ -41,7 +43,7 @@ def placed(dispersions: object) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-def load_dispersions(path: str | Path) -> dict[str, Any]:
+def load_dispersions(path: str | Path) -> dict[str, object]:
     """Read the dispersions of `monte_carlo` from a TOML file.
 
     The file has one table ``[dispersions]``. Its keys are names, groups or patterns; each value is
@@ -118,12 +120,12 @@ def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str,
 
 
 def _spread(value: object) -> object:
-    table: dict[str, Any] = dict(value) if isinstance(value, dict) else {"normal": value}
+    table: dict[str, object] = dict(value) if isinstance(value, dict) else {"normal": value}
     if "tied" in table:
         tied = table.pop("tied")
         return {"range": _spread(table), "tied": tied}
-    if isinstance(table.get("distribution"), str):
-        return _distribution(**table)
+    if isinstance(name := table.get("distribution"), str):
+        return _distribution(name, {k: x for k, x in table.items() if k != "distribution"})
     (form, given), *others = table.items() or [("", None)]
     entries = given if isinstance(given, list) and form in ("uniform", "values") else [given]
     right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
@@ -132,7 +134,7 @@ def _spread(value: object) -> object:
     raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
-def _distribution(distribution: str, **given: object) -> object:
+def _distribution(distribution: str, given: Mapping[str, object]) -> object:
     from scipy import stats
 
     kinds = stats.rv_continuous, stats.rv_discrete
@@ -156,8 +158,11 @@ def _distribution(distribution: str, **given: object) -> object:
     )
 
 
-def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
-    """Return the inverse distribution function of a spread."""
+def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
+    """Return the inverse distribution function of a spread; a number is the value if `fixed`.
+
+    The functions of this module are partial functions; others may be slow.
+    """
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
@@ -184,12 +189,7 @@ def inverse_of(name: str, spread: object) -> Callable[[Array], Array]:
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:
         raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of at least 0")
-    return partial(_normal, deviation)
-
-
-def is_closed_form(inverse: Callable[[Array], Array]) -> bool:
-    """Return whether this module defines an inverse function; other functions may be slow."""
-    return isinstance(inverse, partial) or inverse is whole_number
+    return partial(_choice, np.array([deviation])) if fixed else partial(_normal, deviation)
 
 
 def _uniform(least: float, largest: float, u: Array) -> Array:
@@ -207,13 +207,9 @@ def _normal(deviation: float, u: Array) -> Array:
     return normal
 
 
-def whole_number(u: Array) -> Array:
-    """Return seeds of noise: whole numbers below 2^53, which doubles represent exactly."""
-    return np.floor(u * 2.0**53)
+def _whole(end: float, u: Array) -> Array:
+    return np.floor(end * u)
 
 
-def deviation_of(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse function for the deviation of noise; a number is the deviation itself."""
-    inverse = inverse_of(name, spread)
-    fixed = getattr(inverse, "func", None) is _normal
-    return partial(_choice, np.array([float(spread)])) if fixed else inverse
+# Seeds of noise: whole numbers below 2^53, which doubles represent exactly.
+SEEDS = partial(_whole, 2.0**53)

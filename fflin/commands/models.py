@@ -57,8 +57,8 @@ def info(arguments: Namespace) -> Report:
     """
     import numpy as np
 
-    from fflin.control.authority import point_properties, point_report
-    from fflin.dynamics.actuation import Actuation
+    from fflin.control.authority import point_properties
+    from fflin.dynamics.state import Actuation
     from fflin.robot.fields import limits_of
     from fflin.robot.summary import robot_info
 
@@ -72,10 +72,10 @@ def info(arguments: Namespace) -> Report:
         ends = limits.get(name, (-math.inf, math.inf))
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
     table = grid(cut(rows, "see --json"), "ll")
-    text = f"{robot_info(robot, point_report(properties))}\n\n{table}"
+    text = f"{robot_info(robot, str(properties))}\n\n{table}"
     result = {
         "mass": robot.mass,
-        **properties,
+        **properties._asdict(),
         "joint_names": robot.joint_names,
         "wheels": robot.wheels,
         "state_names": state.names,

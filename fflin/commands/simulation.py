@@ -276,8 +276,8 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
 
     If the operating point is at its own reference, the target pose of the base is the reference.
     """
-    from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.coordinates import frame_of
+    from fflin.dynamics.state import Actuation
     from fflin.linear.fit import require_same
 
     made = f"{arguments.gain} was made for '{gain.robot}'"

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from itertools import combinations, islice
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, Mask
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.fields import limits_of
 from fflin.robot.inputs import named_wheels
@@ -28,35 +26,90 @@ _ROUNDING = 1e-9
 _AXES = "xyz"
 
 
-def point_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
-    """Return mass properties and properties of wheels and thrusters, by name, in base axes."""
+class WheelMomentum(NamedTuple):
+    """Momentum of a robot's wheels in base axes, and momentum that they can store."""
+
+    wheels: int
+    total: Array  # (3,) [N m s]
+    axes: int  # number of axes that the wheels span
+    least: float | None  # largest momentum that can be stored in every direction, if bounded
+
+    def __str__(self) -> str:
+        if not self.wheels:
+            return ""
+        text = (
+            f"{counted(self.wheels, 'wheel')}: total momentum {_vector(self.total)} N m s, "
+            f"magnitude {np.linalg.norm(self.total):.4g}; they span "
+            f"{('no', 'only one', 'only two', 'three')[self.axes]} axes"
+        )
+        if self.least is not None:
+            text += (
+                f", and they store at least {self.least:.4g} N m s in every direction at their "
+                "largest speeds"
+            )
+        return folded([text])
+
+
+class ThrusterAuthority(NamedTuple):
+    """Force and torque that the thrusters alone can produce in every direction.
+
+    Both are None unless the thrusters can push in every direction, all thrusters have limits, and
+    there are at most _MANY thrusters.
+    """
+
+    thrusters: int
+    every_way: bool = False
+    bounded: bool = False
+    least_force: float | None = None  # [N]
+    least_torque: float | None = None  # [N m]
+
+    def __str__(self) -> str:
+        if not self.thrusters:
+            return ""
+        text = f"{counted(self.thrusters, 'thruster')} alone "
+        if not self.every_way:
+            return folded([f"{text}cannot produce a force and a torque in every direction"])
+        text += "produce forces and torques in every direction"
+        if not self.bounded:
+            text += "; some of them have no limit (max)"
+        elif self.least_force is not None:
+            text += (
+                f": at least {self.least_force:.4g} N without a torque about the centre of mass, "
+                f"or {self.least_torque:.4g} N m without a force"
+            )
+        return folded([text])
+
+
+class PointProperties(NamedTuple):
+    """Properties of a robot at an operating point, in base axes."""
+
+    center_of_mass: Array  # (3,) [m]
+    inertia: Array  # (3, 3) [kg m^2], about the centre of mass
+    principal_moments: Array
+    wheel_momentum: WheelMomentum
+    thruster_authority: ThrusterAuthority
+
+    def __str__(self) -> str:
+        moments, axes = np.linalg.eigh(self.inertia)
+        axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
+        rows = [["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]]
+        for row, moment, axis, name in zip(self.inertia, moments, axes.T, _AXES, strict=True):
+            shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
+            along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
+            rows.append([name, *shown, f"{moment:.5g}", *along])
+        head = (
+            f"centre of mass at {_vector(self.center_of_mass)} m in the base frame, and inertia "
+            "about the centre of mass in kg\u00a0m^2, in base axes, at the operating point"
+        )
+        equipment = str(self.wheel_momentum), str(self.thruster_authority)
+        return "\n\n".join(filter(None, (folded([head]), grid(rows), *equipment)))
+
+
+def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
+    """Return mass properties and properties of wheels and thrusters at q and v."""
     center, inertia = mass_properties(robot, q)
-    return {
-        "center_of_mass": center,
-        "inertia": inertia,
-        "principal_moments": np.linalg.eigvalsh(inertia),
-        "wheel_momentum": wheel_properties(robot, q, v),
-        "thruster_authority": thruster_properties(robot, q, center),
-    }
-
-
-def point_report(properties: Mapping[str, Any]) -> str:
-    """Format the properties of a robot at an operating point."""
-    inertia = properties["inertia"]
-    moments, axes = np.linalg.eigh(inertia)
-    axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
-    rows = [["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]]
-    for row, moment, axis, name in zip(inertia, moments, axes.T, _AXES, strict=True):
-        shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
-        along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
-        rows.append([name, *shown, f"{moment:.5g}", *along])
-    head_line = (
-        f"centre of mass at {_vector(properties['center_of_mass'])} m in the base frame, and "
-        "inertia about the centre of mass in kg\u00a0m^2, in base axes, at the operating point"
-    )
-    wheels = wheel_report(properties["wheel_momentum"])
-    thrusters = thruster_report(properties["thruster_authority"])
-    return "\n\n".join(filter(None, (folded([head_line]), grid(rows), wheels, thrusters)))
+    of_equipment = wheel_momentum(robot, q, v), thruster_authority(robot, q, center)
+    return PointProperties(center, inertia, np.linalg.eigvalsh(inertia), *of_equipment)
 
 
 def mass_properties(robot: Robot, q: Array) -> tuple[Array, Array]:
@@ -86,82 +139,33 @@ def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array
     return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
 
 
-def wheel_properties(robot: Robot, q: Array, v: Array) -> dict[str, object]:
-    """Return the total momentum of the wheels, and the momentum that they can store.
-
-    `least` is the largest momentum [N m s] that the wheels can store in every direction. `axes` is
-    the number of axes that the wheels span.
-    """
+def wheel_momentum(robot: Robot, q: Array, v: Array) -> WheelMomentum:
+    """Return the total momentum of the wheels, and the momentum that they can store."""
     axes, stored, largest = wheel_momenta(robot, q, v)
     rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
     bounded = rank == 3 and np.isfinite(largest).all()
-    return {
-        "wheels": stored.size,
-        "total": axes @ stored,
-        "axes": rank,
-        "least": least_reach(axes, -largest, largest, np.eye(3)) if bounded else None,
-    }
+    least = least_reach(axes, -largest, largest, np.eye(3)) if bounded else None
+    return WheelMomentum(stored.size, axes @ stored, rank, least)
 
 
-def wheel_report(properties: Mapping[str, Any]) -> str:
-    """Format the momentum of the wheels, and the number of axes that they span."""
-    if not properties["wheels"]:
-        return ""
-    total, least = properties["total"], properties["least"]
-    text = (
-        f"{counted(properties['wheels'], 'wheel')}: total momentum {_vector(total)} N m s, "
-        f"magnitude {np.linalg.norm(total):.4g}; they span "
-        f"{('no', 'only one', 'only two', 'three')[properties['axes']]} axes"
-    )
-    if least is not None:
-        text += (
-            f", and they store at least {least:.4g} N m s in every direction at their largest "
-            "speeds"
-        )
-    return folded([text])
-
-
-def thruster_properties(robot: Robot, q: Array, center: Array) -> dict[str, object]:
-    """Return the force and torque that the thrusters alone can produce in every direction.
-
-    Both are None unless the thrusters can push in every direction, all thrusters have limits, and
-    there are at most _MANY thrusters.
-    """
-    actuation = Actuation(StateMap(robot))
-    thrusters = actuation.groups.get("thrust", ())
-    found = dict[str, object](thrusters=len(thrusters), every_way=False, bounded=False)
-    found |= {"least_force": None, "least_torque": None}
-    if not len(thrusters):
-        return found
+def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:
+    """Return the authority of the thrusters about a centre of mass (3,)."""
     from fflin.control.channel import input_limits
 
+    actuation = Actuation(StateMap(robot))
+    thrusters = actuation.groups.get("thrust", ())
+    count = len(thrusters)
+    if not count:
+        return ThrusterAuthority(0)
     W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
     low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
-    found["every_way"] = gives_every_wrench(W, np.full(len(thrusters), True))
-    found["bounded"] = bool(np.isfinite(high).all())
-    if found["every_way"] and found["bounded"] and len(thrusters) <= _MANY:
-        found["least_torque"] = least_reach(W, low, high, np.eye(6)[:, :3])
-        found["least_force"] = least_reach(W, low, high, np.eye(6)[:, 3:])
-    return found
-
-
-def thruster_report(properties: Mapping[str, Any]) -> str:
-    """Report whether the thrusters push in every direction, and with what force and torque."""
-    if not properties["thrusters"]:
-        return ""
-    text = f"{counted(properties['thrusters'], 'thruster')} alone "
-    if not properties["every_way"]:
-        return folded([f"{text}cannot produce a force and a torque in every direction"])
-    text += "produce forces and torques in every direction"
-    if not properties["bounded"]:
-        text += "; some of them have no limit (max)"
-    elif properties["least_force"] is not None:
-        text += (
-            f": at least {properties['least_force']:.4g} N without a torque about the centre of "
-            f"mass, or {properties['least_torque']:.4g} N m without a force"
-        )
-    return folded([text])
+    every_way = gives_every_wrench(W, np.full(count, True))
+    bounded = bool(np.isfinite(high).all())
+    if not (every_way and bounded and count <= _MANY):
+        return ThrusterAuthority(count, every_way, bounded)
+    torque, force = (least_reach(W, low, high, part) for part in np.hsplit(np.eye(6), 2))
+    return ThrusterAuthority(count, every_way, bounded, force, torque)
 
 
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:

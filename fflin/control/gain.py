@@ -220,8 +220,8 @@ def make_gain(
     """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
-    return Gain(
-        **{key: getattr(lin, key) for key in _FROM_MODEL},
+    return Gain._of(
+        lin,
         K=solution.K @ S,
         P=S.T @ solution.P @ S,
         Q=S.T @ Q @ S,
@@ -235,13 +235,6 @@ def make_gain(
         regulated=part.state_names,
         _lin=lin,
     )
-
-
-_FROM_MODEL = (
-    *("A", "B", "x0", "u0", "dt", "frame", "robot", "verified"),
-    *("placement", "urdf_sha256"),
-    *("state_names", "input_names", "state_units", "input_units"),
-)
 
 
 def fragility(gain: Gain) -> str:

@@ -16,8 +16,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, number
 from fflin.control.gain import titled
 from fflin.control.optimal.differential_riccati import Coefficients, imbalance
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import require_same
 from fflin.linear.trajectory import Trajectory, cubic
 from fflin.robot.robot import Robot

@@ -260,7 +260,8 @@ def kalman(
     if lin.dt:
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
-    return Estimator(
+    return Estimator._of(
+        whole,
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
         P=S.T @ solution.P @ S,
@@ -271,7 +272,6 @@ def kalman(
         V=noises,
         estimated=lin.state_names,
         verified=lin.verified,
-        **{key: getattr(whole, key) for key in _FROM_MODEL},
     )
 
 
@@ -320,26 +320,17 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
             "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
-    return Compensator(
+    return Compensator._of(
+        e,
         A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
         B=S @ e.L,
         C=-gain.K @ S.T,
         poles=np.concatenate((gain.poles, e.poles)),
-        y0=e.y0,
-        u0=e.u0,
-        dt=e.dt,
         state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
-        robot=e.robot,
         verified=gain.verified and e.verified,
     )
-
-
-_FROM_MODEL = (
-    *("A", "B", "C", "D", "x0", "u0", "y0", "dt", "robot"),
-    *("state_names", "input_names", "output_names"),
-)
 
 
 def disturbance(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -147,8 +147,8 @@ def mpc(
     else:
         made, stages = _about(source, *given)
     acting = limited.at[limited.at < len(lin.input_names)]
-    of: Any = getattr(source.robot, "name", source.robot)
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, limited.names, of))
+    name = source.robot if isinstance(source.robot, str) else source.robot.name
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, limited.names, name))
 
 
 class _Shown:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,9 +20,8 @@ from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import refuse_orbit
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import chosen_limits
@@ -133,7 +132,7 @@ def plan(
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    ends: Any = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
+    ends = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
     x, q, v = (None, *ends) if isinstance(ends, tuple) and len(ends) == 2 else (ends, None, None)
     end = points.point_of(state, x, q, v, lambda: (robot.neutral(), np.zeros(robot.nv)))
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)

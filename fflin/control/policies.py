@@ -13,10 +13,9 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law, input_limits
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
@@ -142,7 +141,7 @@ class Allocation:
     15
     """
 
-    policy: Any
+    policy: object
     design: Robot
 
     @property
@@ -328,7 +327,7 @@ class Loop(Compensation):
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
-        noise: Any = 0.0
+        noise: Array | float = 0.0
         if self._noise is not None:
             size = len(self.at(t).y0)
             noise = vector("noise(t)", self._noise(t), size, "one value for each output")
@@ -378,8 +377,6 @@ def fed_back(policy: object) -> tuple[str, ...]:
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
-    of: Any = lin if schedule is None else schedule
-    if of is None:
-        return ()
-    used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
+    names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
+    used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(names, used, strict=True) if size)

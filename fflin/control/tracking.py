@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -19,10 +19,9 @@ from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import resting_end, steady_regulator
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.fit import require_same, require_turns, sensed
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
@@ -208,7 +207,7 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
+def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
     """Return the policy to simulate, with commands held for `held` [s].
 
     A gain schedule is replaced by the feedback along its trajectory.

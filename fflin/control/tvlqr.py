@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -111,15 +110,13 @@ def tvlqr(
     require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
     steady = asks_steady(Qf)
-    given, by_rule = list[Any]((Q, R)), Q is None and R is None
-    if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
-    end: Any = steady_end(traj) if steady or by_rule else None
-    if by_rule:
+    if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        *given, _, rule = rule_weights(end, weights, pace=pace)
-    Q, R, _ = cost_weights(traj, given[0], given[1], None)
-    Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
+        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
+    elif weights is not None or Q is None or R is None:
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
+    Q, R, _ = cost_weights(traj, Q, R, None)
+    Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
 
     def at(times: Array) -> riccati.Coefficients:
         A, B = traj.matrices_at(times)
@@ -136,7 +133,8 @@ def tvlqr(
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
             residual = Interpolant(t, P, K, (A, B, Q, R), 0.0).residual(at)
-    return GainSchedule(
+    return GainSchedule._of(
+        traj,
         t=t,
         K=K,
         P=P,
@@ -150,12 +148,7 @@ def tvlqr(
         dt=dt,
         weights=rule,
         knots=traj.t,
-        **{key: getattr(traj, key) for key in _OF_REGULATOR},
     )
-
-
-_OF_REGULATOR = ("state_names", "input_names", "verified", "q", "v", "u", "hold", "frame")
-_OF_FILTER = ("state_names", "input_names", "output_names", "verified")
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
@@ -328,19 +321,17 @@ def tvkalman(
         ]
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)
-    return FilterSchedule(
-        t=at_samples.t,
+    return FilterSchedule._of(
+        at_samples,
         L=np.concatenate((L, L[-1:])),
         P=P,
         A=maps[:, :, :nx],
         B=maps[:, :, nx:],
-        **{key: getattr(at_samples, key) for key in "CDy"},
         W=np.array(disturbed),
         V=V,
         residual=residual,
         robot=traj.robot.name,
         dt=dt,
-        **{key: getattr(traj, key) for key in _OF_FILTER},
     )
 
 

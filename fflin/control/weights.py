@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -268,7 +268,7 @@ def _negative(what: str, value: float, where: str, definite: bool) -> InputError
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    given: Mapping[str, object] | None = None,
+    given: Mapping[str, Mapping[str, float]] | None = None,
     *,
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,
@@ -350,7 +350,9 @@ class _Given(NamedTuple):
     largest: bool
 
 
-def _weights_of(lin: LinearModel, given: Mapping[str, Any], of_robot: bool) -> dict[int, _Given]:
+def _weights_of(
+    lin: LinearModel, given: Mapping[str, Mapping[str, float]], of_robot: bool
+) -> dict[int, _Given]:
     """Return {index: given weight}, with states before inputs."""
     states, inputs = lin.state_names, input_keys(lin)
     found, every = dict[int, _Given](), (*states, *inputs)

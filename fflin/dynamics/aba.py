@@ -5,9 +5,8 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import PIN_ANGULAR
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 
 
@@ -36,9 +35,8 @@ class Aba:
         if tau is not None:
             forces += self.state.forces(tau)
         absolute = self.field.absolute(q, v) if self.field else v
-        rate = self._accelerate(
-            self._model, q, absolute, forces, self._external_wrenches(q, absolute, u)
-        )
+        wrenches = self._wrenches(q, absolute, u)
+        rate = self._accelerate(self._model, q, absolute, forces, wrenches)
         return self.field.relative(v, absolute, rate) if self.field else rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
@@ -74,7 +72,7 @@ class Aba:
         here = q, v
         if field:
             q, v = field.near(q, v)
-        external = self._external_wrenches(q, v, u)
+        external = self._wrenches(q, v, u)
         if state.robot.followers:
             assert state.S is not None
             by_q, by_v, by_force = self._constrained_derivatives(q, v, external, tau, state.S)
@@ -98,32 +96,27 @@ class Aba:
         at_rest = np.zeros_like(v)
         by_u = []
         for unit in np.eye(len(u)):
-            forces, wrenches = self.actuation.torques(unit), self._wrenches(q, at_rest, unit)
+            forces = self.actuation.torques(unit)
+            wrenches = self.actuation.wrenches(unit) or self._none
             rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
 
-    def _external_wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return the wrenches on the links, including the gravity gradient of an orbit."""
-        wrenches = self._wrenches(q, v, u)
-        if self.field:
-            wrenches = pin.StdVec_Force(wrenches)
-            pin.forwardKinematics(self._model, self._data, q)
-            for joint, pull in enumerate(self.field.wrenches(self._data)):
-                wrenches[joint] = wrenches[joint] + pull
-        return wrenches
-
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return the wrenches of the inputs and of the gyroscopic torques on the links."""
-        stored = self.state.robot.stored_momentum
-        wrenches = self.actuation.wrenches(u) or self._none
-        if not stored:
+        """Return the wrenches on the links: of inputs, gyroscopic torques and gravity gradient."""
+        stored, wrenches = (
+            self.state.robot.stored_momentum,
+            self.actuation.wrenches(u) or self._none,
+        )
+        if not (stored or self.field):
             return wrenches
         total = pin.StdVec_Force(wrenches)
         pin.forwardKinematics(self._model, self._data, q, v)
         for joint, momentum in stored:
             torque = -np.cross(self._data.v[joint].angular, momentum)
-            total[joint] = wrenches[joint] + pin.Force(np.zeros(3), torque)
+            total[joint] += pin.Force(np.zeros(3), torque)
+        for joint, pull in enumerate(self.field.wrenches(self._data) if self.field else ()):
+            total[joint] += pull
         return total
 
     def _angular_velocity_derivatives(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -18,9 +17,6 @@ from fflin.robot.joints import ROOT, by_joint, find_frame
 from fflin.robot.loading import body_alone
 from fflin.robot.robot import Robot
 from fflin.robot.welding import joined, welded
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,16 +146,16 @@ def jam(
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     at = {name: robot.joint(name).value(q) for name in named}
     left = welded(robot, at)
-    said, impulse = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
+    hit = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
     stopped = [6 + robot.joint_names.index(name) for name in at]
     units = tuple(f"{robot.joint(name).force_unit} s" for name in at)
-    return Impact(impulse=-state.forces(impulse)[stopped], _units=units, **said)
+    return replace(hit, impulse=-state.forces(hit.impulse)[stopped], _units=units)
 
 
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
-) -> tuple[dict[str, Any], Array]:
-    """Join robots at (q, v) to one robot (13.1); return the fields of `Impact` and the impulses."""
+) -> Impact:
+    """Join robots at (q, v) to one robot (13.1); the impulses are generalised ones of the parts."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -182,12 +178,17 @@ def struck(
     G, before = G @ spread, np.concatenate([own_v for *_, own_v in parts])
     nu = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
     jump, v = before - G @ nu, spread @ nu
-    said = {"robot": whole, "q": q, "v": v, "event": event, "_before": parts[0]}
-    return said | {
-        "energy_lost": 0.5 * float(jump @ M @ jump),
-        "momentum": sum(momentum_of(*part) for part in parts),
-        "momentum_after": momentum_of(whole, q, v),
-    }, M @ jump
+    return Impact(
+        robot=whole,
+        q=q,
+        v=v,
+        impulse=M @ jump,
+        energy_lost=0.5 * float(jump @ M @ jump),
+        momentum=np.sum([momentum_of(*part) for part in parts], axis=0),
+        momentum_after=momentum_of(whole, q, v),
+        event=event,
+        _before=parts[0],
+    )
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
@@ -362,9 +363,9 @@ def capture(
     pin.forwardKinematics(robot.model, data, q)
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
     parts = [(robot, q, v), (other, other_q, other_v)]
-    said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
-    said |= {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
-    return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said)
+    hit = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
+    of_impact = vars(hit) | {"impulse": hit.impulse[robot.nv : robot.nv + 6]}
+    return Capture(**of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix)
 
 
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:

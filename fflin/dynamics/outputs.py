@@ -1,5 +1,7 @@
 """Outputs of a robot: their names, units, and two independent evaluations."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -26,7 +28,7 @@ class Sensed(NamedTuple):
     by_v: Array
     by_a: Array | None  # None if no output depends on the acceleration a
 
-    def part(self, rows: slice) -> "Sensed":
+    def part(self, rows: slice) -> Sensed:
         """Return views of the rows of one output."""
         y, by_q, by_v, by_a = self
         return Sensed(y[rows], by_q[rows], by_v[rows], None if by_a is None else by_a[rows])
@@ -53,31 +55,12 @@ class Point(NamedTuple):
         return self.data.oMi[frame.joint] * frame.placement
 
 
-class World(NamedTuple):
-    """Robot at its actual pose, with the positions, velocities and accelerations of all joints."""
-
-    model: pin.Model
-    data: pin.Data
-    reference: pin.SE3  # placement relative to which outputs are expressed
-    gravity: Array
-    stored: tuple[tuple[int, Array], ...]  # as in `Point`
-    spin: Array  # (3,) angular velocity of the orbit frame in its own axes
-
-    def placement(self, frame: Carried) -> pin.SE3:
-        """Return the placement of a frame in the world."""
-        return self.data.oMi[frame.joint] * frame.placement
-
-    def velocity(self, frame: Carried) -> pin.Motion:
-        """Return the twist of a frame in its own axes."""
-        return frame.placement.actInv(self.data.v[frame.joint])
-
-
 # f(point, sensed, *frames) writes outputs and derivatives into `sensed`. Functions with frames
 # require that pin.computeForwardKinematicsDerivatives was called; functions without frames call
 # the Pinocchio functions that they need.
 Derivatives: TypeAlias = Callable[..., None]
 
-# f(world, attitudes of the frames at the point of linearisation, *frames) returns the output.
+# f(measuring, attitudes of the frames at the point of linearisation, *frames) returns the output.
 Value: TypeAlias = Callable[..., Array]
 
 
@@ -87,11 +70,11 @@ def _center_of_mass_derivatives(at: Point, to: Sensed) -> None:
     to.by_q[:] = at.R.dot(jacobian)
 
 
-def _center_of_mass(world: World, _: object) -> Array:
+def _center_of_mass(world: Measuring, _: object) -> Array:
     return np.asarray(world.reference.actInv(_center(world)))
 
 
-def _center(world: World) -> Array:
+def _center(world: Measuring) -> Array:
     model, data = world.model, world.data
     bodies = [(model.inertias[i], data.oMi[i]) for i in range(1, model.njoints)]
     moments = [inertia.mass * placement.act(inertia.lever) for inertia, placement in bodies]
@@ -116,7 +99,7 @@ def _momentum_derivatives(at: Point, to: Sensed) -> None:
         to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[PIN_ANGULAR])
 
 
-def _momentum(world: World, _: object) -> Array:
+def _momentum(world: Measuring, _: object) -> Array:
     model, data, turned = world.model, world.data, world.reference.rotation.T
     momenta = [data.oMi[i].act(model.inertias[i] * data.v[i]) for i in range(1, model.njoints)]
     linear = sum(h.linear for h in momenta)
@@ -134,7 +117,7 @@ def _frame_pose_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     to.by_q[3:] = jacobian[PIN_ANGULAR]
 
 
-def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
+def _frame_pose(world: Measuring, before: Sequence[Array], frame: Carried) -> Array:
     placement = world.placement(frame)
     rotation = pin.log3(before[0].T @ placement.rotation)
     return np.concatenate((world.reference.actInv(placement.translation), rotation))
@@ -153,7 +136,7 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     to.by_v[3:] = R.dot(jacobian[PIN_LINEAR])
 
 
-def _frame_velocity(world: World, _: object, frame: Carried) -> Array:
+def _frame_velocity(world: Measuring, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     R = world.reference.rotation.T @ world.placement(frame).rotation
     return np.concatenate((velocity.angular, R @ velocity.linear))
@@ -174,7 +157,7 @@ def _relative_pose_derivatives(at: Point, to: Sensed, *frames: Carried) -> None:
     to.by_q[:, :6] = 0.0  # a motion of the base moves both frames alike
 
 
-def _relative_pose(world: World, before: Sequence[Array], *frames: Carried) -> Array:
+def _relative_pose(world: Measuring, before: Sequence[Array], *frames: Carried) -> Array:
     placement, other = map(world.placement, frames)
     rotation = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ placement.rotation)
     position = other.rotation.T @ (placement.translation - other.translation)
@@ -195,7 +178,7 @@ def _gyroscope_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     to.by_q[:] += skew(spin).dot(to.by_v)  # the frame's angular Jacobian
 
 
-def _gyroscope(world: World, _: object, frame: Carried) -> Array:
+def _gyroscope(world: Measuring, _: object, frame: Carried) -> Array:
     spin = world.placement(frame).rotation.T @ world.spin
     return np.asarray(world.velocity(frame).angular + spin)
 
@@ -214,7 +197,7 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
 
 
-def _accelerometer(world: World, _: object, frame: Carried) -> Array:
+def _accelerometer(world: Measuring, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     rate = frame.placement.actInv(world.data.a[frame.joint]).linear
     acceleration = rate + np.cross(velocity.angular, velocity.linear)
@@ -298,7 +281,24 @@ class Sensing:
         sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
         if not self._kinds:
             return sensed
-        at = self._point(data, q, v)
+        state, robot = self.state, self.state.robot
+        centred_q, centred_v = q.copy(), v.copy()
+        centred_q[:7], centred_v[PIN_LINEAR] = self._home, 0.0
+        R, r_b = _STANDING
+        if not self._own_reference:
+            R, r_b = state.rotation(q), state.positions(q)
+        at = Point(
+            model=robot.model,
+            data=data,
+            q=centred_q,
+            v=centred_v,
+            R=R,
+            r_b=r_b,
+            v_b=v[PIN_LINEAR],
+            g=state.gravity(q),
+            stored=robot.stored_momentum,
+            spin=R.T @ state.orbit[0] if state.orbit else np.zeros(3),
+        )
         derived = False
         for rows, slopes, frames in self._kinds:
             if frames and not derived:
@@ -314,28 +314,6 @@ class Sensing:
             slopes(at, sensed.part(rows), *frames)
         return sensed
 
-    def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
-        state, robot = self.state, self.state.robot
-        centred_q, centred_v = q.copy(), v.copy()
-        centred_q[:7] = self._home
-        centred_v[PIN_LINEAR] = 0.0
-        R, r_b = _STANDING
-        if not self._own_reference:
-            R, r_b = state.rotation(q), state.positions(q)
-        spin = R.T @ state.orbit[0] if state.orbit else np.zeros(3)
-        return Point(
-            model=robot.model,
-            data=data,
-            q=centred_q,
-            v=centred_v,
-            R=R,
-            r_b=r_b,
-            v_b=v[PIN_LINEAR],
-            g=state.gravity(q),
-            stored=robot.stored_momentum,
-            spin=spin,
-        )
-
 
 class Measuring:
     """Outputs y by elementary kinematics, to check C and D.
@@ -344,33 +322,36 @@ class Measuring:
     """
 
     def __init__(self, state: StateMap, q: Array) -> None:
-        self.state = state
-        robot, field = state.robot, state.field
-        self._world = world = World(
-            model=robot.model,
-            data=robot.create_data(),
-            reference=state.reference,
-            gravity=np.array(robot.gravity),
-            stored=robot.stored_momentum,
-            spin=np.zeros(3) if field is None else field.rate,
-        )
-        pin.forwardKinematics(robot.model, world.data, q)
-        frames = [[find_frame(world.model, x) for x in output.frames] for output in robot.outputs]
-        attitudes = [[np.array(world.placement(f).rotation) for f in group] for group in frames]
+        self.state, robot, field = state, state.robot, state.field
+        self.model, self.data = robot.model, robot.create_data()
+        self.reference, self.gravity = state.reference, np.array(robot.gravity)
+        self.stored = robot.stored_momentum  # as in `Point`
+        # Angular velocity (3,) of the orbit frame in its own axes.
+        self.spin = np.zeros(3) if field is None else field.rate
+        pin.forwardKinematics(self.model, self.data, q)
+        frames = [[find_frame(self.model, x) for x in output.frames] for output in robot.outputs]
+        attitudes = [[np.array(self.placement(f).rotation) for f in group] for group in frames]
         self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
 
     def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
         """Return y (ny,); `a` (nv,) is dv/dt as Pinocchio's ABA returns it."""
-        world = self._world
-        pin.forwardKinematics(world.model, world.data, q, v, a)
+        pin.forwardKinematics(self.model, self.data, q, v, a)
         return np.concatenate(
             [
-                KINDS[type(output)][1](world, attitudes, *frames)
+                KINDS[type(output)][1](self, attitudes, *frames)
                 if type(output) in KINDS
                 else x[state_indices(self.state, output)]
                 for output, frames, attitudes in self._outputs
             ]
         )
+
+    def placement(self, frame: Carried) -> pin.SE3:
+        """Return the placement of a frame in the world."""
+        return self.data.oMi[frame.joint] * frame.placement
+
+    def velocity(self, frame: Carried) -> pin.Motion:
+        """Return the twist of a frame in its own axes."""
+        return frame.placement.actInv(self.data.v[frame.joint])
 
 
 def state_indices(state: StateMap, output: Output) -> list[int]:

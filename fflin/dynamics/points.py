@@ -11,8 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, instance, numbers, placement
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot

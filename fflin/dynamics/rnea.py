@@ -9,10 +9,10 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
 # The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
@@ -61,9 +61,10 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides = [
-            joint.idx_q for joint in robot.joints if joint.prismatic and joint.kind != "modal"
-        ]
+        self._slides: list[int] = []
+        for joint in robot.joints:
+            if joint.prismatic and joint.kind != "modal":
+                self._slides.append(joint.idx_q)
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -141,23 +142,23 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
     # largest principal moment, and its mass times the squared length of the path to it. The path
     # runs from joint to joint, with prismatic joints within `STROKE`.
-    joints = model.joints.tolist()
-    slides = [joint.shortname().startswith("JointModelP") for joint in joints]
-    if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):
-        return None
-    inertias, parents = model.inertias.tolist(), model.parents.tolist()
-    placements = model.jointPlacements.tolist()
-    distances = [0.0] * len(joints)
-    for index in range(2, len(joints)):
-        step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
-        distances[index] = distances[parents[index]] + step
-    masses = [item.mass for item in inertias]
-    moments = [
+    joints, inertias = model.joints.tolist(), model.inertias.tolist()
+    placements, parents = model.jointPlacements.tolist(), model.parents.tolist()
+    slides, distances = [False] * len(joints), [0.0] * len(joints)
+    masses, moments = [0.0] * len(joints), [0.0] * len(joints)
+    for index, item in enumerate(inertias):
+        if index > ROOT:
+            kind = joints[index].shortname()[:11]
+            if kind not in ("JointModelR", "JointModelP"):
+                return None
+            slides[index] = kind == "JointModelP"
+            step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
+            distances[index] = distances[parents[index]] + step
+        masses[index] = item.mass
         # The largest row sum of an inertia matrix is a bound of its largest principal moment.
-        item.mass * (distance + float(np.linalg.norm(item.lever))) ** 2
-        + float(np.abs(item.inertia).sum(axis=0).max())
-        for item, distance in zip(inertias, distances, strict=True)
-    ]
+        turning = float(np.abs(item.inertia).sum(axis=0).max())
+        arm = distances[index] + float(np.linalg.norm(item.lever))
+        moments[index] = item.mass * arm**2 + turning
     bounds: Array = np.empty(model.nv)
     for index in range(len(joints) - 1, 1, -1):
         bounds[joints[index].idx_v] = masses[index] if slides[index] else moments[index]
@@ -194,17 +195,6 @@ class AccelerationDerivatives(NamedTuple):
         return self.slopes[..., self.c.shape[-1] :]
 
 
-class Gyroscopic(NamedTuple):
-    r"""Gyroscopic torques :math:`-\omega \times h` of stored momentum, and their derivatives."""
-
-    wrenches: pin.StdVec_Force  # on every joint, in its frame
-    force: Array  # generalised force (nv,) of the gyroscopic torques
-    # Derivatives (nv, nv) of `force`. In `by_q` the Jacobian is constant, because RNEA's
-    # derivatives with `wrenches` already include the change of the Jacobian.
-    by_q: Array
-    by_v: Array
-
-
 class Accelerations:
     """Solution of ``M nudot + b = B u`` of a robot, with its derivatives, in base axes."""
 
@@ -226,7 +216,9 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
+        self._stored: list[tuple[int, Array]] = []
+        for joint, momentum in robot.stored_momentum:
+            self._stored.append((joint, skew(momentum)))
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
@@ -257,9 +249,12 @@ class Accelerations:
         self._inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
-        gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
-        if gyroscopic:
-            bias = bias - gyroscopic.force
+        wrenches = actuation.wrenches(u)
+        if self._stored:
+            wrenches, turning, turning_by_q, turning_by_v = self._gyroscopic(
+                q_still, v_still, wrenches
+            )
+            bias = bias - turning
         if tide:
             bias = bias - pull
         force = (u if actuation.default else columns.dot(u)) - state.forces(bias)
@@ -269,13 +264,12 @@ class Accelerations:
 
         # Derivatives of M a + b - B u - springs (3.3), (7.1). The wrenches are constant in the
         # frames of their links, so RNEA's derivatives include -d(B u)/dq.
-        wrenches = gyroscopic.wrenches if gyroscopic else actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
         by_q, by_v, _ = pin.computeRNEADerivatives(
             model, data, q_still, v_still, state.spread(c), *external
         )
-        if gyroscopic:
-            by_q, by_v = by_q - gyroscopic.by_q, by_v - gyroscopic.by_v
+        if self._stored:
+            by_q, by_v = by_q - turning_by_q, by_v - turning_by_v
         if tide:
             by_q = by_q - pull_by_q
         state.project_transposed(by_q, self._by_q_m)
@@ -292,12 +286,19 @@ class Accelerations:
             inverse.dot(columns, by_u)
         return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
 
-    def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the gyroscopic torques; their `wrenches` include the wrenches of the inputs."""
+    def _gyroscopic(
+        self, q: Array, v: Array, wrenches: pin.StdVec_Force | None
+    ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
+        r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
+
+        They are added to the wrenches of the inputs on every joint, and returned as a generalised
+        force (nv,) with its derivatives (nv, nv) over q and v. In the derivative over q the
+        Jacobian is constant, because RNEA's derivatives with these wrenches already include the
+        change of the Jacobian.
+        """
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in its axes, the torque h x omega is the
         # generalised force J^T [h]x J v (6.3).
-        wrenches = self._actuation.wrenches(u)
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))
@@ -310,4 +311,4 @@ class Accelerations:
             force += jacobian.T @ torque
             by_q += jacobian.T @ momentum @ turned
             by_v += jacobian.T @ momentum @ jacobian
-        return Gyroscopic(wrenches, force, by_q, by_v)
+        return wrenches, force, by_q, by_v

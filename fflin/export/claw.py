@@ -20,10 +20,9 @@ from fflin.base.record import reading
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, read_file
 from fflin.control.policies import Loop, Policy, Sample
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.export.laws import measured
 from fflin.export.writing import digest_of
 from fflin.linear.fit import require_same, require_turns, sensed

@@ -21,9 +21,8 @@ from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation, Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import Signals, require_same, sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel

@@ -15,25 +15,12 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import INDICES, LANED, Struct, empty
+from fflin.kernel.bodies import factorise, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
-from fflin.kernel.inertia import factorise
-from fflin.kernel.lanes import (
-    add_row,
-    called,
-    inlined,
-    load,
-    poke,
-    remove_components,
-    root,
-    row_product,
-    row_products,
-    store,
-    width,
-    write_scaled,
-)
-from fflin.kernel.rnea import write_columns
+from fflin.kernel.lanes import called, inlined, load, root, store
 
 # Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
 # smallest.
@@ -68,36 +55,23 @@ class Allocation(namedtuple("Allocation", "asking giving point work problem")):
 
 
 LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
-ALLOCATION = Struct(
-    Allocation,
-    asking=MECHANICS,
-    giving=MECHANICS,
-    point=POINT,
-    work=LANED,
-    problem=LEAST_SQUARES,
-)
+_ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
+ALLOCATION = Struct(Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES)
 
 
 def least_squares(least, most, size):
     """Return a problem with bounds (k,) and forces (size,); its arrays are not laned."""
     count = len(least)
+    lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
+    lengths |= {"A": count * size, "Q": count * (size + count), "R": count * count}
+    lengths |= dict.fromkeys(("columns", "given"), (count + 1) * size)
+    lengths |= {"b": size + count, "wanted": size}
     return empty(LEAST_SQUARES)._replace(
         least=least,
         most=most,
-        columns=np.zeros((count + 1) * size),
-        given=np.zeros((count + 1) * size),
-        A=np.zeros(count * size),
-        Q=np.zeros(count * (size + count)),
-        R=np.zeros(count * count),
-        b=np.zeros(size + count),
-        y=np.zeros(count),
-        wanted=np.zeros(size),
-        x=np.zeros(count),
-        s=np.zeros(count),
-        low=np.zeros(count),
-        high=np.zeros(count),
         state=np.zeros(count, dtype=np.intp),
         order=np.zeros(count, dtype=np.intp),
+        **{name: np.zeros(length) for name, length in lengths.items()},
     )
 
 
@@ -135,37 +109,32 @@ def _realise(allocation, point, commanded):
     factorise(work, tree)
     vec.copy(commanded, 0, own.pushing, 0, len(commanded))
     turn_held(asking, own)
-    push(work, asking, own.pushing)
-    vec.copy(work, asking.layout.c, columns, count * size, size)
-    _write_all(work, giving, own, columns)
-    for column in range(count + 1):
-        half_solve(work, tree, columns, column * size)
-    for lane in range(width(point.u)):
-        solve(problem, size, lane)
-        for index in range(count):
-            poke(point.u, index, lane, problem.x[index])
-
-
-@inlined
-def _write_all(work, giving, own, columns):
-    """Write the generalised force per unit of each input, one input after the other."""
-    tree, layout, loads = giving.tree, giving.layout, giving.loads
-    size, carried = len(tree.row), len(loads.body)
-    for entry in range(len(giving.row) * size):
+    push(work, tree, own.pushing)
+    vec.copy(work, tree.c, columns, count * size, size)
+    # The generalised force per unit of each input, one input after the other.
+    tree = giving.tree
+    carried = len(tree.wrench_body)
+    for entry in range(len(tree.driven) * size):
         store(columns, entry, 0.0)
-    for index in range(len(giving.row)):
-        if giving.row[index] >= 0:
-            store(columns, index * size + giving.row[index], 1.0)
+    for index in range(len(tree.driven)):
+        if tree.driven[index] >= 0:
+            store(columns, index * size + tree.driven[index], 1.0)
     for index in range(len(giving.held)):
         at, axes = giving.held[index], vec.columns_of(seen(giving, own.q))
         for axis in range(3):
             turned = axes[0][axis], axes[1][axis], axes[2][axis]
-            vec.put3(columns, (at + axis) * size + giving.row[at], turned)
-    write_columns(work, tree, layout, loads)
+            vec.put3(columns, (at + axis) * size + tree.driven[at], turned)
+    write_columns(work, tree)
     for index in range(carried):
-        first = loads.input[index] * size
+        first = tree.input[index] * size
         for row in range(size):
-            store(columns, first + row, load(work, layout.columns + row * carried + index))
+            store(columns, first + row, load(work, tree.columns + row * carried + index))
+    for column in range(count + 1):
+        half_solve(work, asking.tree, columns, column * size)
+    for lane in range(lanes.width(point.u)):
+        solve(problem, size, lane)
+        for index in range(count):
+            lanes.poke(point.u, index, lane, problem.x[index])
 
 
 @called
@@ -173,10 +142,10 @@ def solve(problem, size, lane):
     """Write the solution of one lane into x; x is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count, given = problem.least, problem.most, len(problem.least), problem.given
-    write_scaled(problem.columns, lane, 1.0, given)
+    lanes.write_scaled(problem.columns, lane, 1.0, given)
     last = count * size
-    unit = root(row_product(given, 0, given, 0, last))
-    force = root(row_product(given, last, given, last, size))
+    unit = root(lanes.row_product(given, 0, given, 0, last))
+    force = root(lanes.row_product(given, last, given, last, size))
     nothing = not (unit > 0.0 and force > 0.0)
     scale = 1.0 if nothing else unit / force
     free = 0
@@ -189,15 +158,15 @@ def solve(problem, size, lane):
             problem.order[free] = j
             free += 1
     if not nothing:
-        write_scaled(given, 0, 1.0 / unit, A)
-        write_scaled(given[last:], 0, 1.0 / force, wanted)
+        lanes.write_scaled(given, 0, 1.0 / unit, A)
+        lanes.write_scaled(given[last:], 0, 1.0 / force, wanted)
         free, kept = _solve_scaled(problem, size, free, 0)
         # Remove the part of the force that the inputs cannot produce, because its rounding error
         # would exceed the rows of LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
-                add_row(wanted, 0, x[j], A, j * size, size)
+                lanes.add_row(wanted, 0, x[j], A, j * size, size)
         _solve_scaled(problem, size, free, kept)
     for j in range(count):
         x[j] = min(max(x[j] / scale, least[j]), most[j]) + 0.0 * force
@@ -258,51 +227,40 @@ def _fit(problem, size, free, kept):
 
     First, the columns of the free inputs from the index `kept` on are added to the QR factor.
     """
-    s, Q, R, b, order, y = problem.s, problem.Q, problem.R, problem.b, problem.order, problem.y
-    count = len(s)
-    _subtract_bound(problem, size)
+    s, x, Q, R, b, y = problem.s, problem.x, problem.Q, problem.R, problem.b, problem.y
+    order, A, count = problem.order, problem.A, len(problem.s)
+    rows = size + count
+    # The residual without the free inputs: `wanted` minus the force of the inputs at their bounds.
+    b[:] = 0.0
+    lanes.write_scaled(problem.wanted, 0, 1.0, b[:size])
+    for j in range(count):
+        if problem.state[j] != _FREE and x[j] != 0.0:
+            b[size + j] = -LEAST * x[j]
+            lanes.add_row(b, 0, -x[j], A, j * size, size)
+    # Each new column of the factor is orthogonal to the columns before it.
     for at in range(kept, free):
-        _orthogonalise(problem, size, at)
-    remove_components(Q, size + count, free, b, y, 0)
+        j = order[at]
+        column = Q[at * rows : (at + 1) * rows]
+        column[:] = 0.0
+        lanes.write_scaled(A[j * size :], 0, 1.0, column[:size])
+        column[size + j] = LEAST
+        lanes.remove_components(Q, rows, at, column, R, at * count)
+        length = root(lanes.row_product(column, 0, column, 0, rows))
+        lanes.write_scaled(column, 0, 1.0 / length, column)
+        R[at * count + at] = length
+    lanes.remove_components(Q, rows, free, b, y, 0)
     for at in range(free - 1, -1, -1):
         value = y[at] / R[at * count + at]
         s[order[at]] = value
         if at > 0:
-            add_row(y, 0, -value, R, at * count, at)
-
-
-@inlined
-def _subtract_bound(problem, size):
-    """Write `wanted` minus the force of the inputs at their bounds into b."""
-    x, b, state = problem.x, problem.b, problem.state
-    b[:] = 0.0
-    write_scaled(problem.wanted, 0, 1.0, b[:size])
-    for j in range(len(x)):
-        if state[j] != _FREE and x[j] != 0.0:
-            b[size + j] = -LEAST * x[j]
-            add_row(b, 0, -x[j], problem.A, j * size, size)
-
-
-@inlined
-def _orthogonalise(problem, size, at):
-    """Add a free input's column to the QR factor, orthogonal to the columns before it."""
-    Q, R, count, j = problem.Q, problem.R, len(problem.least), problem.order[at]
-    rows = size + count
-    column = Q[at * rows : (at + 1) * rows]
-    column[:] = 0.0
-    write_scaled(problem.A[j * size :], 0, 1.0, column[:size])
-    column[size + j] = LEAST
-    remove_components(Q, rows, at, column, R, at * count)
-    length = root(row_product(column, 0, column, 0, rows))
-    write_scaled(column, 0, 1.0 / length, column)
-    R[at * count + at] = length
+            lanes.add_row(y, 0, -value, R, at * count, at)
 
 
 @called
 def _steepest(problem, size):
     """Return the untried input whose release reduces the error fastest, or -1 without one."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
-    row_products(problem.A, size, b, slopes)
+    lanes.row_products(problem.A, size, b, slopes)
     for j in range(len(state)):
         if state[j] == _LOW or state[j] == _HIGH:
             slope = LEAST * b[size + j] + slopes[j]

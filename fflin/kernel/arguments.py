@@ -8,9 +8,9 @@ within compiled code passes one pointer. The words must not change during a call
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from fflin.kernel.tree import work_space
 class Kind(NamedTuple):
     """Type of a field: a number (`axes` = 0) or a C-contiguous array with `axes` axes."""
 
-    dtype: Any
+    dtype: type[np.generic]
     axes: int = 0
 
 
@@ -34,79 +34,95 @@ LANED = Kind(np.float64, 2)
 _NOTHING = work_space(0)
 
 
-class Struct:
-    """Type of a named tuple of kernel arguments: `kind` for all fields except `others`."""
+T_co = TypeVar("T_co", bound=NamedTuple, covariant=True)
+T = TypeVar("T", bound=NamedTuple)
 
-    def __init__(self, made: Any, kind: Any = REALS, name: str = "", /, **others: Any) -> None:
+
+class Struct(Generic[T_co]):
+    """Type of a named tuple of kernel arguments.
+
+    `others` are the kinds of single fields, and `groups` lists the fields of a kind, separated by
+    spaces. All remaining fields are of the kind `rest`.
+    """
+
+    def __init__(
+        self,
+        made: type[T_co],
+        rest: Kind = REALS,
+        groups: Mapping[Kind, str] | None = None,
+        /,
+        **others: Kind | Struct[NamedTuple],
+    ) -> None:
+        for kind, fields in (groups or {}).items():
+            others |= dict.fromkeys(fields.split(), kind)
         self.made = made
-        self.kinds = {field: others.get(field, kind) for field in made._fields}
-        ends = np.cumsum([0, *map(_size, self.kinds.values())]).tolist()
-        self.places, self.size = dict(zip(self.kinds, ends, strict=False)), ends[-1]
-        self.name = f"Struct({name or made.__name__})"
+        self.kinds = {field: others.get(field, rest) for field in made._fields}
+        sizes = [k.size if isinstance(k, Struct) else 1 + k.axes for k in self.kinds.values()]
+        ends = np.cumsum([0, *sizes]).tolist()
+        self.places = dict(zip(self.kinds, ends, strict=False))
+        self.size: int = ends[-1]
+        self.name = f"Struct({made.__name__})"
 
 
-def _size(kind: Any) -> int:
-    """Return the number of words of a kind."""
-    if isinstance(kind, Struct):
-        return kind.size
-    size: int = 1 + kind.axes
-    return size
-
-
-class Opener(NamedTuple):
+class Opener(Generic[T_co]):
     """Function by which compiled code interprets an array of words as a struct."""
 
-    kind: Struct
+    def __init__(self, kind: Struct[T_co]) -> None:
+        self.kind = kind
 
-    def __call__(self, words: Any) -> Any:
+    def __call__(self, words: T) -> T:
         """Return the argument unchanged: uncompiled functions take the named tuple itself."""
         return words
 
 
-def laid_out(value: Any, kind: Any, fresh: Callable[[Array, Array], None] | None = None) -> Any:
+@cache
+def empty(kind: Struct[T]) -> T:
+    """Return a value of a kind with empty arrays and with numbers equal to 0."""
+    parts: list[object] = []
+    for of in kind.kinds.values():
+        if isinstance(of, Struct):
+            parts.append(empty(of))
+        elif of == LANED:
+            parts.append(_NOTHING)
+        else:
+            parts.append(np.zeros((0,) * of.axes, of.dtype) if of.axes else 0)
+    return kind.made._make(parts)
+
+
+def laid_out(value: T, kind: Struct[T], fresh: Callable[[Array, Array], None] | None = None) -> T:
     """Convert the fields of a named tuple to the kinds of its struct.
 
     `fresh` is called with each new laned array and with the column of values that fills it.
     """
-    if isinstance(kind, Struct):
-        if value is empty(kind):
-            return value
-        parts = zip(value, kind.kinds.values(), strict=True)
-        return type(value)._make(laid_out(part, of, fresh) for part, of in parts)
-    if kind == LANED:
-        if not len(value):
-            return _NOTHING
-        lanes = work_space(len(value))
-        lanes[:] = column = np.array(value, dtype=float)[:, None]
-        if fresh:
-            fresh(lanes, column)
-        return lanes
-    if kind.axes:
-        return np.require(value, kind.dtype, ("C", "W"))
-    return kind.dtype(value).item()
+    if value is empty(kind):
+        return value
+    parts: list[object] = []
+    for part, of in zip(value, kind.kinds.values(), strict=True):
+        if isinstance(of, Struct):
+            parts.append(laid_out(part, of, fresh))
+        elif of == LANED and len(part):
+            lanes, column = work_space(len(part)), np.array(part, dtype=float)[:, None]
+            lanes[:] = column
+            parts.append(lanes)
+            if fresh:
+                fresh(lanes, column)
+        elif of.axes:
+            parts.append(_NOTHING if of == LANED else np.require(part, of.dtype, ("C", "W")))
+        else:
+            parts.append(of.dtype(part).item())
+    return value._make(parts)
 
 
-@cache
-def empty(kind: Any) -> Any:
-    """Return a value of a kind with empty arrays and with numbers equal to 0."""
-    if isinstance(kind, Struct):
-        return kind.made._make(map(empty, kind.kinds.values()))
-    if kind == LANED:
-        return _NOTHING
-    return np.zeros((0,) * kind.axes, kind.dtype) if kind.axes else 0
-
-
-def words_of(value: Any, kind: Any) -> NDArray[np.int64]:
+def words_of(value: T, kind: Struct[T]) -> NDArray[np.int64]:
     """Return the words of a named tuple from `laid_out`; its arrays must outlive the words."""
-    return np.array(_words(value, kind), dtype=np.int64)
-
-
-def _words(value: Any, kind: Any) -> list[int]:
-    if isinstance(kind, Struct):
-        parts = zip(value, kind.kinds.values(), strict=True)
-        return [word for part, of in parts for word in _words(part, of)]
-    if kind.axes:
-        fits = value.dtype == kind.dtype and value.ndim == kind.axes
-        assert value.flags.c_contiguous and (fits or not value.size)
-        return [value.__array_interface__["data"][0], *value.shape]
-    return [int(np.float64(value).view(np.int64)) if kind == REAL else int(value)]
+    words: list[int] = []
+    for part, of in zip(value, kind.kinds.values(), strict=True):
+        if isinstance(of, Struct):
+            words += words_of(part, of).tolist()
+        elif of.axes:
+            fits = part.dtype == of.dtype and part.ndim == of.axes
+            assert part.flags.c_contiguous and (fits or not part.size)
+            words += [part.__array_interface__["data"][0], *part.shape]
+        else:
+            words.append(int(np.float64(part).view(np.int64)) if of == REAL else int(part))
+    return np.array(words, dtype=np.int64)

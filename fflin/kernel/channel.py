@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, WHOLE, Struct
+from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
 
 
@@ -44,20 +44,9 @@ class Channel(
 
 
 WHEELS = Struct(Wheels, at=INDICES, row=INDICES)
-PULSES = Struct(
-    Pulses,
-    at=INDICES,
-    on_off=FLAGS,
-    time=REAL,
-    **dict.fromkeys(("left", "level", "end"), LANED),
-)
-CHANNEL = Struct(
-    Channel,
-    wheels=WHEELS,
-    pulses=PULSES,
-    **dict.fromkeys(("slots", "sample"), WHOLE),
-    **dict.fromkeys(("held", "pending", "delay", "fresh"), LANED),
-)
+PULSES = Struct(Pulses, REALS, {LANED: "left level end"}, at=INDICES, on_off=FLAGS, time=REAL)
+_OF_CHANNEL = {WHOLE: "slots sample", LANED: "held pending delay fresh"}
+CHANNEL = Struct(Channel, REALS, _OF_CHANNEL, wheels=WHEELS, pulses=PULSES)
 
 
 @inlined
@@ -87,39 +76,43 @@ def transmit(channel, step, nu, u):
 
     u is a new command only in steps in which the policy is evaluated (`is_asked`).
     """
+    count = len(channel.low)
     if is_asked(channel, step):
         limit(channel, u)
         if channel.sample > 0:
-            count = len(channel.low)
             first = (step // channel.sample) % channel.slots * count
             vec.copy(u, 0, channel.pending, first, count)
+    # Write the latest command that has arrived after the delay, or its pulses.
     if channel.sample > 0:
-        _arrive(channel, step, u)
-    _limit_wheel_speeds(channel, nu, u)
-
-
-@inlined
-def _arrive(channel, step, u):
-    """Write the latest command that has arrived after the delay, or its pulses, into the inputs."""
-    count, any_fresh = len(channel.low), False
-    for lane in range(width(channel.delay)):
-        since = step - int(peek(channel.delay, 0, lane))
-        arrives = since >= 0 and since % channel.sample == 0
-        if arrives:
-            first = (since // channel.sample) % channel.slots * count
-            for index in range(count):
-                value = peek(channel.pending, first + index, lane)
-                poke(channel.held, index, lane, value)
-        fresh = arrives or (since < 0 and step % channel.sample == 0)
-        poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
-        any_fresh = any_fresh or fresh
-    if any_fresh:
-        _begin_pulses(channel, step, channel.held)
-    vec.copy(channel.held, 0, u, 0, count)
-    pulses = channel.pulses
-    for index in range(len(pulses.at)):
-        level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
-        store(u, pulses.at[index], level)
+        any_fresh = False
+        for lane in range(width(channel.delay)):
+            since = step - int(peek(channel.delay, 0, lane))
+            arrives = since >= 0 and since % channel.sample == 0
+            if arrives:
+                first = (since // channel.sample) % channel.slots * count
+                for index in range(count):
+                    value = peek(channel.pending, first + index, lane)
+                    poke(channel.held, index, lane, value)
+            fresh = arrives or (since < 0 and step % channel.sample == 0)
+            poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
+            any_fresh = any_fresh or fresh
+        if any_fresh:
+            _begin_pulses(channel, step, channel.held)
+        vec.copy(channel.held, 0, u, 0, count)
+        pulses = channel.pulses
+        for index in range(len(pulses.at)):
+            level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
+            store(u, pulses.at[index], level)
+    # Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero.
+    wheels = channel.wheels
+    for index in range(len(wheels.at)):
+        least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
+        speed, stiffness = load(nu, wheels.row[index]), load(wheels.stiffness, index)
+        low = clipped(stiffness * (load(wheels.least_speed, index) - speed), least, most)
+        high = clipped(stiffness * (load(wheels.most_speed, index) - speed), least, most)
+        low, high = chosen(low, 0.0, low, 0.0), chosen(0.0, high, high, 0.0)
+        at = wheels.at[index]
+        store(u, at, clipped(load(u, at), low, high))
 
 
 @inlined
@@ -143,17 +136,3 @@ def _begin_pulses(channel, step, u):
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
         store(pulses.end, index, chosen(0.5, fresh, end, load(pulses.end, index)))
         store(pulses.level, index, chosen(0.5, fresh, level, load(pulses.level, index)))
-
-
-@inlined
-def _limit_wheel_speeds(channel, nu, u):
-    """Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero."""
-    wheels = channel.wheels
-    for index in range(len(wheels.at)):
-        least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
-        speed, stiffness = load(nu, wheels.row[index]), load(wheels.stiffness, index)
-        low = clipped(stiffness * (load(wheels.least_speed, index) - speed), least, most)
-        high = clipped(stiffness * (load(wheels.most_speed, index) - speed), least, most)
-        low, high = chosen(low, 0.0, low, 0.0), chosen(0.0, high, high, 0.0)
-        at = wheels.at[index]
-        store(u, at, clipped(load(u, at), low, high))

@@ -14,9 +14,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event, Lock, RLock, Thread
-from typing import Any
+from typing import TYPE_CHECKING
 
 from fflin.base.errors import unknown
+
+if TYPE_CHECKING:
+    from fflin.kernel.machine_code import Compiled
 
 # Linux files that contain a container's quota of computing time and the quota's period [us]. The
 # first line is for control groups version 2, the second for version 1.
@@ -58,28 +61,27 @@ def numba_is_there() -> bool:
     return find_spec("numba") is not None
 
 
-def checked_engine(engine: Any) -> str | None:
+def checked_engine(engine: object) -> str | None:
     """Return an engine's name or None unchanged; raise `UnknownNameError` for anything else."""
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     return engine
 
 
-def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
+def kernel(module: str, name: str, what: str = "the batch kernel") -> Compiled:
     """Return a function of the kernel, whose machine code is stored on disk at its first call."""
     with _TURN:  # several threads may call at once
         return _prepared(module, name, what)
 
 
 @cache
-def _prepared(module: str, name: str, what: str) -> Any:
+def _prepared(module: str, name: str, what: str) -> Compiled:
     from fflin.kernel.machine_code import translated
 
     compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name))
-    folder = Path(compiled.stats.cache_path)
+    folder = Path(str(compiled.stats.cache_path))
     with _between_processes(folder / f"{module}.{name}.lock"):
-        older = set(_entries(folder, module, name)) - set(_kept(folder, module, name))
-        for entry in older:
+        for entry in _stored(folder, module, name)[1]:
             entry.unlink(missing_ok=True)
     if not isinstance(compiled.compile, partial):  # wrapped twice, the lock would block itself
         compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
@@ -87,12 +89,17 @@ def _prepared(module: str, name: str, what: str) -> Any:
 
 
 def _compile_alone(
-    compile: Callable[[Any], Any], folder: Path, module: str, name: str, what: str, signature: Any
-) -> Any:
+    compile: Callable[[object], object],
+    folder: Path,
+    module: str,
+    name: str,
+    what: str,
+    signature: object,
+) -> object:
     """Compile for a signature; if another process has compiled it meanwhile, load its code."""
     # The lock _COMPILING admits one thread, so no thread waits for a file lock of its own process.
     with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
-        if not _kept(folder, module, name):
+        if not _stored(folder, module, name)[0]:
             _log.warning(
                 "fflin: compiling %s; this happens only once, because the code is stored in %s",
                 what,
@@ -157,21 +164,15 @@ def is_kept(module: str, name: str) -> bool:
     """Return whether the machine code of a function for the current sources is on disk."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
-    return any(_kept(folder, module, name) for folder in folders)
+    return any(_stored(folder, module, name)[0] for folder in folders)
 
 
-def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return the index files of stored machine code that are newer than all sources."""
+def _stored(folder: Path, module: str, name: str) -> tuple[list[Path], list[Path]]:
+    """Return the index files of machine code for this Python: newer than all sources, and older."""
     # numba checks the age of the function's own file only, not of the files of called functions.
-    source = max(file.stat().st_mtime for file in _sources())
-    entries = _entries(folder, module, name)
-    return [entry for entry in entries if entry.stat().st_mtime >= source]
-
-
-def _entries(folder: Path, module: str, name: str) -> list[Path]:
-    """Return the index files of a function's machine code for this version of Python."""
-    return list(folder.glob(f"{module}.{name}-*.{VERSION}*.nbi"))
-
-
-def _sources() -> list[Path]:
-    return list(Path(__file__).parent.glob("*.py"))
+    source = max(file.stat().st_mtime for file in Path(__file__).parent.glob("*.py"))
+    newer: list[Path] = []
+    older: list[Path] = []
+    for entry in folder.glob(f"{module}.{name}-*.{VERSION}*.nbi"):
+        (newer if entry.stat().st_mtime >= source else older).append(entry)
+    return newer, older

@@ -16,18 +16,18 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Kind, Struct
-from fflin.kernel.inertia import factorise, inwards, outwards, solve, spatial_inertia_times
+from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
 from fflin.kernel.lanes import angle, called, chosen, inlined, load, store
-from fflin.kernel.rnea import collect, load_bodies, move_bodies, stored_momentum, write_columns
-from fflin.kernel.tree import Layout, Loads, Tree
+from fflin.kernel.tree import Tree
 
 
 class Mechanics(
     namedtuple(
         "Mechanics",
-        "tree layout loads gravity index circling scale springy rest row held triads origin faults",
+        "tree gravity index circling scale springy rest held triads origin faults",
     )
 ):
     """Robot parameters of the loop; each array of doubles may have a second axis of eight lanes.
@@ -37,7 +37,6 @@ class Mechanics(
       (`circling`); the change of the entry per unit of q_m (`scale`, 1 except for modal
       amplitudes); whether the joint has a spring or damper (`springy`); and the position at which
       the spring is relaxed (`rest`).
-    - `row`: the coordinate that each input drives, -1 for a body-fixed wrench.
     - `held`: three inputs form each vector on the base in reference axes; this is the index of the
       first. `triads`: the same for vectors in any axes.
     - `origin` (7,): placement of the world's origin relative to the reference.
@@ -61,39 +60,29 @@ class Point(namedtuple("Point", "q nu u pushing wrench")):
     """
 
 
-_OF_BODIES = dict.fromkeys(("parent", "index", "coordinate", "target", "row", "depth", "path"))
-_SIZES = "entries places own inertias packed scaled diagonal square size"
-TREE = Struct(
-    Tree,
-    **dict.fromkeys(_OF_BODIES, INDICES),
-    **dict.fromkeys(_SIZES.split(), WHOLE),
-    **dict.fromkeys(("fixed", "bodies"), LANED),
-    unbounded=FLAGS,
-    axes=Kind(np.float64, 3),
-    common=Kind(np.intp, 2),
-)
-LAYOUT = Struct(Layout, WHOLE)
-LOADS = Struct(Loads, LANED, body=INDICES, input=INDICES, stored_body=INDICES)
+class CommonPoint(Point):
+    """Point that is common to all lanes."""
+
+
+_OF_TREE = {
+    INDICES: "parent index coordinate target row depth path driven wrench_body input stored_body",
+    WHOLE: "entries places own inertias packed scaled diagonal square motion load bias c columns "
+    "lower held size",
+    LANED: "fixed bodies wrench stored stiffness damping",
+}
+_AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
+TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
-# A point that is common to all lanes.
-COMMON_POINT = Struct(Point, REALS, "CommonPoint")
-MECHANICS = Struct(
-    Mechanics,
-    INDICES,
-    tree=TREE,
-    layout=LAYOUT,
-    loads=LOADS,
-    faults=ACTUATOR_FAULTS,
-    **dict.fromkeys(("circling", "springy"), FLAGS),
-    **dict.fromkeys(("gravity", "scale", "rest", "origin"), REALS),
-)
+COMMON_POINT = Struct(CommonPoint)
+_OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
+MECHANICS = Struct(Mechanics, INDICES, _OF_MECHANICS, tree=TREE, faults=ACTUATOR_FAULTS)
 
 
 @called
 def configure(work, robot, q):
     """Write the poses of all bodies and the packed M at a configuration."""
-    outwards(work, robot.tree, q)
-    inwards(work, robot.tree)
+    bodies.outwards(work, robot.tree, q)
+    bodies.inwards(work, robot.tree)
 
 
 @inlined
@@ -134,20 +123,19 @@ def turn_held(robot, point):
 
 
 @inlined
-def push(work, robot, pushing):
+def push(work, tree, pushing):
     """Write the generalised force of inputs in base axes at the offset of c."""
-    tree, layout, loads = robot.tree, robot.layout, robot.loads
-    force, size, count = layout.c, len(tree.row), len(loads.body)
+    size, count = len(tree.row), len(tree.wrench_body)
     for index in range(size):
-        store(work, force + index, 0.0)
-    for index in range(len(robot.row)):
-        if robot.row[index] >= 0:
-            vec.add(work, force + robot.row[index], load(pushing, index))
-    write_columns(work, tree, layout, loads)
+        store(work, tree.c + index, 0.0)
+    for index in range(len(tree.driven)):
+        if tree.driven[index] >= 0:
+            vec.add(work, tree.c + tree.driven[index], load(pushing, index))
+    bodies.write_columns(work, tree)
     for index in range(count):
-        u = load(pushing, loads.input[index])
+        u = load(pushing, tree.input[index])
         for row in range(size):
-            vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
+            vec.add(work, tree.c + row, load(work, tree.columns + row * count + index) * u)
 
 
 @called
@@ -156,23 +144,23 @@ def accelerate(work, robot, point, rates, to):
 
     M is overwritten by its factor.
     """
-    tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
-    force, size = layout.c, len(tree.row)
-    push(work, robot, point.pushing)
+    tree, nu = robot.tree, point.nu
+    force, size = tree.c, len(tree.row)
+    push(work, tree, point.pushing)
     vec.copy(work, force, point.wrench, 0, 6)
-    move_bodies(work, tree, layout, nu)
-    load_bodies(work, tree, layout, loads)
-    collect(work, tree, layout)
+    bodies.move_bodies(work, tree, nu)
+    bodies.load_bodies(work, tree)
+    bodies.collect(work, tree)
     for index in range(size):
-        vec.add(work, force + index, -load(work, layout.bias + index))
+        vec.add(work, force + index, -load(work, tree.bias + index))
     for joint in range(len(robot.index)):
         if robot.springy[joint]:
             stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
-            pull = load(loads.stiffness, joint) * stretch
-            pull = pull + load(loads.damping, joint) * load(nu, 6 + joint)
+            pull = load(tree.stiffness, joint) * stretch
+            pull = pull + load(tree.damping, joint) * load(nu, 6 + joint)
             vec.add(work, force + 6 + joint, -pull)
-    factorise(work, tree)
-    solve(work, tree, force)
+    bodies.factorise(work, tree)
+    bodies.solve(work, tree, force)
     vec.copy(work, force, rates, to, size)
     # dv_b/dt also contains gravity and -omega_b x v_b.
     fall = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
@@ -274,8 +262,8 @@ def _momentum_error(work, robot, nu, momentum):
         row = vec.get6(work, tree.packed + tree.row[index])
         error = vec.minus6(error, vec.times6(row, load(nu, index)))
     angular, linear = error
-    for index in range(len(robot.loads.stored_body)):
-        angular = vec.minus(angular, stored_momentum(work, tree, robot.loads, index))
+    for index in range(len(tree.stored_body)):
+        angular = vec.minus(angular, stored_momentum(work, tree, index))
     return angular, linear
 
 

@@ -6,25 +6,12 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
-from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, Opener, Struct
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, REALS, Opener, Struct
 from fflin.kernel.channel import CHANNEL, is_asked, transmit
-from fflin.kernel.forward import (
-    MECHANICS,
-    MOMENTUM_REFERENCE,
-    POINT,
-    accelerate,
-    add_wrench,
-    apply_faults,
-    begin_step,
-    configure,
-    end_step,
-    impose,
-    kept_at,
-    start_at,
-    turn_held,
-)
+from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.lanes import angle, below, chosen, compiled, inlined, load, root, store
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 
@@ -99,7 +86,7 @@ def _record(rows, row, point, reference, t):
     for values in (point.q, point.nu, point.u):
         vec.copy(values, 0, rows, at, len(values))
         at += len(values)
-    momentum, center = kept_at(reference, t)
+    momentum, center = forward.kept_at(reference, t)
     vec.put6(rows, at, momentum)
     vec.put3(rows, at + 6, center)
 
@@ -124,8 +111,8 @@ def _act(work, channel, law, robot, point, step, stage, t):
             command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
             allocate(law.allocation, point, law.u)
         transmit(channel, step, point.nu, point.u)
-    apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
-    turn_held(robot, point)
+    forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
+    forward.turn_held(robot, point)
 
 
 @inlined
@@ -157,11 +144,11 @@ def advance(words, clock, last, every, rows, work):
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
     h, row = method.h, 0
-    configure(work, robot, point.q)
+    forward.configure(work, robot, point.q)
     if clock[0] == 0:
-        start_at(work, robot, kept, point)
+        forward.start_at(work, robot, kept, point)
     for step in range(clock[0], last):
-        begin_step(kept)
+        forward.begin_step(kept)
         vec.copy(point.q, 0, stages.first, 0, len(point.q))
         vec.copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
@@ -172,18 +159,18 @@ def advance(words, clock, last, every, rows, work):
                 if every > 0 and step % every == 0:
                     _record(rows, row, point, kept, step * h)
                     row += 1
-            accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
+            forward.accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
             if of.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
-                add_wrench(work, robot, kept, point, weight, moment)
+                forward.add_wrench(work, robot, kept, point, weight, moment)
             _move(robot, method, stages, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
-            configure(work, robot, point.q)
+            forward.configure(work, robot, point.q)
         if of.pushed:
-            end_step(kept, h)
+            forward.end_step(kept, h)
         if of.project:
-            impose(work, robot, kept, point, (step + 1) * h)
+            forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
         if not goes_on(of.stop, robot.origin, point.q, point.nu):
             break
@@ -209,16 +196,18 @@ class RunStatistics(
     """
 
 
-_IN_LANES = "sizes largest_x largest_u largest outside errors inputs states"
 RUN_STATISTICS = Struct(
     RunStatistics,
+    REALS,
+    {
+        INDICES: "kind steps",
+        LANED: "sizes largest_x largest_u largest outside errors inputs states",
+    },
     robot=MECHANICS,
     law=LAW,
     path=PATH,
     settled=REAL,
     at=POINT,
-    **dict.fromkeys(("kind", "steps"), INDICES),
-    **dict.fromkeys(_IN_LANES.split(), LANED),
 )
 _opened_statistics = Opener(RUN_STATISTICS)
 

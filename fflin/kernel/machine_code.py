@@ -5,58 +5,257 @@ machine code for each function together with all functions that it calls. A func
 chain of ten calls would be compiled ten times. Here a part (a function called only by compiled
 functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
 Python calls.
+
+The operations of `kernel.lanes` are compiled for one number or for eight at once. An array with one
+axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and one
+instruction for all eight. A single double stands for eight equal numbers. So a function that is
+written for one number can be compiled for eight.
+
+LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
+vector type `Lanes`, whose operations LLVM compiles to vector instructions. If the registers of a
+machine are narrower, LLVM splits the eight numbers over several registers.
 """
 
 from __future__ import annotations
 
-from functools import cache
+import operator
+from collections.abc import Callable, Sequence
+from functools import cache, wraps
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core.codegen import CPUCodeLibrary
+from numba import extending
+from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.typing.templates import AttributeTemplate
-from numba.extending import (
-    infer_getattr,
-    intrinsic,
-    lower_getattr_generic,
-    models,
-    register_model,
-)
+from numba.core.datamodel import DataModelManager
+from numba.core.dispatcher import _CompileStats
+from numba.core.typing.context import BaseContext as TypingContext
+from numba.core.typing.templates import AttributeTemplate, Signature
 from numba.np.arrayobj import populate_array
+from numba.types import Array, Type, boolean, float64, intp, void
 
-from fflin.kernel.arguments import Opener, Struct
-from fflin.kernel.lane_code import OPERATIONS
-from fflin.kernel.lanes import HOW, LOOPS
+from fflin.kernel import lanes as uncompiled
+from fflin.kernel.arguments import Kind, Opener, Struct
+from fflin.kernel.tree import LANES
 
-_WORD, _DOUBLE = ir.IntType(64), ir.DoubleType()
+_DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
+_VECTOR = ir.VectorType(_DOUBLE, LANES)
+_BYTES = 8  # alignment of a double
+
+# Writes the code of an operation for LLVM values, and returns its result.
+Generator: TypeAlias = Callable[..., ir.Value]
+# Returns the signature of an operation for the numba types of its arguments.
+Typer: TypeAlias = Callable[..., Signature]
+
+
+class Lanes(Type):
+    """numba type of eight doubles in one vector."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+lanes = Lanes()
+
+
+@extending.register_model(Lanes)
+class _LanesModel(extending.models.PrimitiveModel):
+    def __init__(self, manager: DataModelManager, kind: Lanes) -> None:
+        super().__init__(manager, kind, _VECTOR)
+
+
+def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """Copy a double to all lanes; return lanes unchanged."""
+    if value.type == _VECTOR:
+        return value
+    nothing = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(nothing, value, _INT32(0))
+    return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None))
+
+
+def _alike(builder: ir.IRBuilder, *values: ir.Value) -> Sequence[ir.Value]:
+    """Convert all values to lanes if one of them has lanes."""
+    if any(value.type == _VECTOR for value in values):
+        return [_spread(builder, value) for value in values]
+    return values
+
+
+def _together(*kinds: Type) -> Type:
+    """Return the common type of numbers, or None if one of them is not a number."""
+    if any(kind not in (lanes, float64) for kind in kinds):
+        return None
+    return lanes if lanes in kinds else float64
+
+
+def _arithmetic(python: Callable[..., object], generate: Generator) -> None:
+    """Define an operator of Python for lanes, and for lanes with doubles."""
+
+    def typed(left: Type, right: Type) -> Type | None:
+        return lanes if _together(left, right) == lanes else None
+
+    def lowered(
+        _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
+    ) -> ir.Value:
+        return generate(builder, *_alike(builder, *values), flags=["contract"])
+
+    extending.type_callable(python)(lambda _: typed)
+    for kinds in (Lanes, Lanes), (Lanes, numba.types.Float), (numba.types.Float, Lanes):
+        extending.lower_builtin(python, *kinds)(lowered)
+
+
+_arithmetic(operator.add, ir.IRBuilder.fadd)
+_arithmetic(operator.sub, ir.IRBuilder.fsub)
+_arithmetic(operator.mul, ir.IRBuilder.fmul)
+_arithmetic(operator.truediv, ir.IRBuilder.fdiv)
+extending.type_callable(operator.neg)(lambda _: lambda value: lanes if value == lanes else None)
+
+
+@extending.lower_builtin(operator.neg, Lanes)
+def _negative(
+    _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
+) -> ir.Value:
+    return builder.fneg(*values)
+
+
+# {function of `kernel.lanes`: operation that replaces it in compiled code}.
+OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
+
+
+def _operation(
+    replaced: Callable[..., object], typed: Typer
+) -> Callable[[Generator], Callable[..., object]]:
+    """Decorate a function that generates the code which replaces a function of `kernel.lanes`.
+
+    The function gets an array as the address of its first entry, a double or a vector.
+    """
+
+    def decorated(generate: Generator) -> Callable[..., object]:
+        @extending.intrinsic
+        @wraps(generate)  # numba reads the number of arguments
+        def operation(_: TypingContext, *kinds: Type) -> tuple[Signature, Generator]:
+            def generated(
+                context: BaseContext,
+                builder: ir.IRBuilder,
+                _: Signature,
+                values: Sequence[ir.Value],
+            ) -> ir.Value:
+                given = list(values)
+                if isinstance(kinds[0], Array):
+                    given[0] = context.make_array(kinds[0])(context, builder, values[0]).data
+                    if kinds[0].ndim == 2:
+                        given[0] = builder.bitcast(given[0], _VECTOR.as_pointer())
+                found = generate(builder, *given)
+                return context.get_dummy_value() if found is None else found
+
+            return typed(*kinds), generated
+
+        OPERATIONS[replaced] = operation
+        return generate
+
+    return decorated
+
+
+def _held(array: Array) -> Type:
+    """Return the type of an array's entries."""
+    return lanes if array.ndim == 2 else float64
+
+
+@_operation(uncompiled.load, lambda array, index: _held(array)(array, intp))
+def _load(builder: ir.IRBuilder, array: ir.Value, index: ir.Value) -> ir.Value:
+    value = builder.load(builder.gep(array, [index]))
+    value.align = _BYTES
+    return value
+
+
+def _type_store(array: Array, index: Type, value: Type) -> Signature:
+    return void(array, intp, value if _held(array) == value == lanes else float64)
+
+
+@_operation(uncompiled.store, _type_store)
+def _store(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, value: ir.Value) -> None:
+    place = builder.gep(array, [index])
+    written = _spread(builder, value) if place.type.pointee == _VECTOR else value
+    builder.store(written, place).align = _BYTES
+
+
+@_operation(uncompiled.splat, lambda array, value: _held(array)(array, float64))
+def _splat(builder: ir.IRBuilder, array: ir.Value, value: ir.Value) -> ir.Value:
+    return _spread(builder, value) if array.type.pointee == _VECTOR else value
+
+
+def _rounding(replaced: Callable[..., object], name: str) -> None:
+    def generate(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+        of = f"v{LANES}f64" if value.type == _VECTOR else "f64"
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(value.type, [value.type]), f"llvm.{name}.{of}"
+        )
+        return builder.call(function, [value])
+
+    _operation(replaced, lambda value: value(value))(generate)
+
+
+_rounding(uncompiled.floor, "floor")
+_rounding(uncompiled.whole, "rint")
+_rounding(uncompiled.root, "sqrt")
+
+
+@_operation(uncompiled.chosen, lambda *kinds: _together(*kinds)(*kinds))
+def _chosen(
+    builder: ir.IRBuilder, left: ir.Value, right: ir.Value, less: ir.Value, other: ir.Value
+) -> ir.Value:
+    left, right, less, other = _alike(builder, left, right, less, other)
+    return builder.select(builder.fcmp_ordered("<", left, right), less, other)
+
+
+@_operation(uncompiled.below, boolean)
+def _below(builder: ir.IRBuilder, value: ir.Value, bound: ir.Value) -> ir.Value:
+    value, bound = _alike(builder, value, bound)
+    less = builder.fcmp_ordered("<", value, bound)
+    if value.type != _VECTOR:
+        return less
+    bits = ir.IntType(LANES)
+    return builder.icmp_signed("==", builder.bitcast(less, bits), ir.Constant(bits, -1))
+
+
+@_operation(uncompiled.angle, lambda *kinds: _together(*kinds)(*kinds))
+def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
+    kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
+    atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")
+    pair = _alike(builder, sine, cosine)
+    if pair[0].type == _DOUBLE:
+        return builder.call(atan2, pair)
+    result = ir.Constant(_VECTOR, ir.Undefined)
+    for lane in map(_INT32, range(LANES)):
+        one = builder.call(atan2, [builder.extract_element(each, lane) for each in pair])
+        result = builder.insert_element(result, one, lane)
+    return result
 
 
 class _NoEnvironments:
     """numba code generator that sets no environment: a part has no machine code to refer to it."""
 
-    def __init__(self, codegen: Any) -> None:
+    def __init__(self, codegen: object) -> None:
         self._codegen = codegen
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._codegen, name)
 
-    def set_env(self, *_: Any) -> None:
+    def set_env(self, *_: object) -> None:
         """Ignore the environment."""
 
 
 class PartLibrary(CPUCodeLibrary):
     """LLVM code of a part, and the other parts that it calls."""
 
-    def __init__(self, codegen: Any, name: str) -> None:
-        super().__init__(codegen, name)
-        self._whole: Any = None
+    _whole: ir.Module | None = None
 
     @property
-    def codegen(self) -> Any:
+    def codegen(self) -> _NoEnvironments:
         """Compiler of this part."""
         return _NoEnvironments(self._codegen)
 
@@ -65,7 +264,7 @@ class PartLibrary(CPUCodeLibrary):
         self._raise_if_finalized()
         self._finalized = True
 
-    def add_linking_library(self, library: Any) -> None:
+    def add_linking_library(self, library: CodeLibrary) -> None:
         """Record a library whose functions this part calls."""
         super().add_linking_library(library)
         self._reload_init.update(library._reload_init)
@@ -75,26 +274,24 @@ class PartLibrary(CPUCodeLibrary):
         self._ensure_finalized()
         return 0
 
-    def _called(self, found: dict[Any, None]) -> None:
+    def _called(self, found: dict[CodeLibrary, ir.Module]) -> None:
+        """Add the LLVM code of each called function, without the code that a part calls."""
         for library in self._linking_libraries:
             if library not in found:
-                found[library] = None
-                if isinstance(library, PartLibrary):
+                part = isinstance(library, PartLibrary)
+                get = CPUCodeLibrary if part else type(library)
+                found[library] = get._get_module_for_linking(library)
+                if part:
                     library._called(found)
 
-    def _own_module(self) -> Any:
-        """Return the LLVM code without the code of called functions."""
-        return super()._get_module_for_linking()
-
-    def _get_module_for_linking(self) -> Any:
+    def _get_module_for_linking(self) -> ir.Module:
         """Return the LLVM code with one copy of each called part."""
         if self._whole is None:
-            found: dict[Any, None] = {self: None}
+            found = {self: super()._get_module_for_linking()}
             self._called(found)
-            self._whole = self._own_module().clone()
-            for library in list(found)[1:]:
-                part = isinstance(library, PartLibrary)
-                module = library._own_module() if part else library._get_module_for_linking()
+            own, *called = found.values()
+            self._whole = own.clone()
+            for module in called:
                 self._whole.link_in(module, preserve=True)
         return self._whole
 
@@ -102,51 +299,55 @@ class PartLibrary(CPUCodeLibrary):
 class PartCompiler(Compiler):
     """numba's compiler pipeline for a part."""
 
-    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
-        super().__init__(typingctx, targetctx, library, *rest)
+    def __init__(
+        self, typing: TypingContext, target: BaseContext, library: CodeLibrary, *rest: object
+    ) -> None:
+        super().__init__(typing, target, library, *rest)
         if library is None:
             self.state.library = PartLibrary(self.state.targetctx.codegen(), "part")
 
 
-class _StructType(numba.types.Type):
+class _StructType(Type):
     """The numba type of a struct: a pointer to its words."""
 
-    def __init__(self, struct: Struct) -> None:
+    def __init__(self, struct: Struct[NamedTuple]) -> None:
         self.struct = struct
         super().__init__(name=struct.name)
 
 
-def _numba_type(kind: Any) -> Any:
+def _numba_type(kind: Kind | Struct[NamedTuple]) -> Type:
     """Return the numba type of a kind."""
     if isinstance(kind, Struct):
         return _StructType(kind)
     number = numba.from_dtype(np.dtype(kind.dtype))
-    return numba.types.Array(number, kind.axes, "C") if kind.axes else number
+    return Array(number, kind.axes, "C") if kind.axes else number
 
 
-@register_model(_StructType)
-class _StructModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
+@extending.register_model(_StructType)
+class _StructModel(extending.models.PrimitiveModel):
+    def __init__(self, manager: DataModelManager, kind: _StructType) -> None:
         super().__init__(manager, kind, _WORD.as_pointer())
 
 
-@infer_getattr
+@extending.infer_getattr
 class _Fields(AttributeTemplate):
     key = _StructType
 
-    def generic_resolve(self, kind: Any, name: str) -> Any:
+    def generic_resolve(self, kind: _StructType, name: str) -> Type | None:
         found = kind.struct.kinds.get(name)
         return None if found is None else _numba_type(found)
 
 
-@lower_getattr_generic(_StructType)
-def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
+@extending.lower_getattr_generic(_StructType)
+def _field(
+    context: BaseContext, builder: ir.IRBuilder, kind: _StructType, words: ir.Value, name: str
+) -> ir.Value:
     found, first = _numba_type(kind.struct.kinds[name]), kind.struct.places[name]
 
-    def at(place: int) -> Any:
+    def at(place: int) -> ir.Value:
         return builder.gep(words, [_WORD(first + place)])
 
-    def word(place: int) -> Any:
+    def word(place: int) -> ir.Value:
         value = builder.load(at(place))
         # The words are constant during a call, so LLVM may reuse a value that it has read.
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -154,17 +355,15 @@ def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
 
     if isinstance(found, _StructType):
         return at(0)
-    if found == numba.types.float64:
+    if found == float64:
         return builder.bitcast(word(0), _DOUBLE)
-    if found == numba.types.boolean:
+    if found == boolean:
         return builder.trunc(word(0), ir.IntType(1))
-    if not isinstance(found, numba.types.Array):
+    if not isinstance(found, Array):
         return word(0)
     array = context.make_array(found)(context, builder)
     shape = [word(1 + axis) for axis in range(found.ndim)]
-    size = context.get_constant(
-        numba.intp, context.get_abi_sizeof(context.get_data_type(found.dtype))
-    )
+    size = context.get_constant(intp, context.get_abi_sizeof(context.get_data_type(found.dtype)))
     strides = [size]
     for length in shape[:0:-1]:
         strides.insert(0, builder.mul(strides[0], length))
@@ -173,24 +372,27 @@ def _field(context: Any, builder: Any, kind: Any, words: Any, name: str) -> Any:
     return array._getvalue()
 
 
-def opener(kind: Struct) -> Any:
+def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
     """Return the numba function that interprets an array of words as a struct."""
 
-    @intrinsic
-    def opened(typing: Any, words: Any) -> Any:
-        def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-            return context.make_array(words)(context, builder, arguments[0]).data
+    @extending.intrinsic
+    def opened(_: TypingContext, words: Array) -> tuple[Signature, Generator]:
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, _: Signature, values: Sequence[ir.Value]
+        ) -> ir.Value:
+            return context.make_array(words)(context, builder, values[0]).data
 
         return _StructType(kind)(words), generate
 
-    return opened
+    opened_function: Callable[..., object] = opened
+    return opened_function
 
 
 # A product and a sum may become one fused instruction, which rounds once. A division by zero gives
 # infinity. Reference counting of arrays is off, because it would take three quarters of the
 # running time. So kernel functions cannot allocate arrays.
-_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
-_PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_OPTIONS: dict[str, object] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
+_PART: dict[str, object] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
 _DECORATORS = {
     "inlined": numba.njit(forceinline=True, **_PART),
@@ -199,8 +401,18 @@ _DECORATORS = {
 }
 
 
+class Compiled(Protocol):
+    """Function that numba compiles for each set of argument types."""
+
+    compile: Callable[[object], object]
+    stats: _CompileStats
+
+    def __call__(self, *arguments: object) -> None:
+        """Run the machine code."""
+
+
 @cache
-def translated(function: Any) -> Any:
+def translated(function: FunctionType) -> Compiled:
     """Convert a function of the kernel, and the functions that it calls, to numba functions."""
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:
@@ -209,17 +421,19 @@ def translated(function: Any) -> Any:
     twin = FunctionType(
         function.__code__, names, function.__name__, function.__defaults__, function.__closure__
     )
-    return _DECORATORS[HOW[function]](twin)
+    return _DECORATORS[uncompiled.HOW[function]](twin)
 
 
-def _counterpart(value: Any) -> Any:
+def _counterpart(value: object) -> object:
     """Return the value that compiled code uses in place of a global of a kernel module."""
     if isinstance(value, Opener):
         return opener(value.kind)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):
         return _translated_module(value)
-    if isinstance(value, FunctionType) and LOOPS.get(value, value) in HOW:
-        return translated(LOOPS.get(value, value))
+    if isinstance(value, FunctionType):
+        loop = uncompiled.LOOPS.get(value, value)
+        if isinstance(loop, FunctionType) and loop in uncompiled.HOW:
+            return translated(loop)
     return OPERATIONS.get(value, value) if callable(value) else value
 
 

@@ -9,24 +9,13 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
-from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, WHOLE, Struct
+from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
+from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.lanes import (
-    angle,
-    called,
-    chosen,
-    inlined,
-    load,
-    peek,
-    poke,
-    splat,
-    store,
-    whole,
-    width,
-)
-from fflin.kernel.rnea import move_bodies
+from fflin.kernel.lanes import angle, called, chosen, inlined, load, splat, store, whole
 from fflin.kernel.tree import MOTION, PLACE
 
 _NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
@@ -51,15 +40,8 @@ class Path(
     """
 
 
-PATH = Struct(
-    Path,
-    **dict.fromkeys(("hold", "ends"), FLAG),
-    **dict.fromkeys(("ahead", "over", "last"), REAL),
-    held=INDICES,
-    order=WHOLE,
-    e=LANED,
-    point=COMMON_POINT,
-)
+_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
+PATH = Struct(Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT)
 
 
 @inlined
@@ -216,18 +198,16 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-GRID = Struct(Grid, at=LANED, **dict.fromkeys(("joint", "first", "stride"), INDICES))
-GYROS = Struct(Gyros, body=INDICES)
-FILTER = Struct(Filter, z=LANED, rates=LANED)
 LAW = Struct(
     Law,
+    REALS,
+    {LANED: "x y added u"},
     kind=WHOLE,
     turned=FLAGS,
-    grid=GRID,
-    filter=FILTER,
+    grid=Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED),
+    filter=Struct(Filter, z=LANED, rates=LANED),
     measured=INDICES,
-    gyros=GYROS,
-    **dict.fromkeys(("x", "y", "added", "u"), LANED),
+    gyros=Struct(Gyros, body=INDICES),
     path=PATH,
     allocation=ALLOCATION,
 )
@@ -259,22 +239,16 @@ def read_state(robot, law, point, row):
 
 
 @inlined
-def _turn_gyros(work, robot, gyros, nu, x, first):
-    """Write the gyroscope outputs into x, starting at the index `first`."""
-    move_bodies(work, robot.tree, robot.layout, nu)
-    for index in range(len(gyros.body)):
-        body = gyros.body[index]
-        rate = vec.get3(work, robot.layout.motion + body * MOTION)
-        rate = vec.across(vec.get_columns(work, robot.tree.places + body * PLACE), rate)
-        vec.put3(x, first + 3 * index, vec.across(vec.get_columns(gyros.axes, 9 * index), rate))
-
-
-@inlined
 def _measure(work, robot, law, point, count):
     """Write the outputs y of a sample, including its noise."""
-    outputs = len(law.measured)
-    if len(law.gyros.body) > 0:
-        _turn_gyros(work, robot, law.gyros, point.nu, law.x, 2 * len(point.nu))
+    outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
+    if len(gyros.body) > 0:
+        move_bodies(work, tree, point.nu)
+    for index in range(len(gyros.body)):
+        rate = vec.get3(work, tree.motion + gyros.body[index] * MOTION)
+        axes = vec.get_columns(work, tree.places + gyros.body[index] * PLACE)
+        rate = vec.across(vec.get_columns(gyros.axes, 9 * index), vec.across(axes, rate))
+        vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
         store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
@@ -313,15 +287,17 @@ def _feed_back_between(robot, law, point):
         store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
     for index in range(inputs):
         store(u, index, 0.0)
-    for lane in range(width(u)):
+    for lane in range(lanes.width(u)):
         for corner in range(1 << len(grid.joint)):
             weight, cell = _corner(grid, corner, lane)
             for row in range(inputs if weight > 0.0 else 0):
                 at = cell * inputs + row
-                total = peek(grid.offset, at, lane)
+                total = lanes.peek(grid.offset, at, lane)
                 for column in range(size):
-                    total -= peek(grid.K, at * size + column, lane) * peek(y, column, lane)
-                poke(u, row, lane, peek(u, row, lane) + weight * total)
+                    total -= lanes.peek(grid.K, at * size + column, lane) * lanes.peek(
+                        y, column, lane
+                    )
+                lanes.poke(u, row, lane, lanes.peek(u, row, lane) + weight * total)
 
 
 @inlined
@@ -330,7 +306,7 @@ def _corner(grid, corner, lane):
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1
-        value = min(max(peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
+        value = min(max(lanes.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
         k = first
         while k < last - 1 and value >= grid.values[k + 1]:
             k += 1

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -22,7 +21,7 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 # Numbers of entries of a body's pose (x, y and z axes, and the origin relative to the parent's
 # origin) and of its inertia (m, m c, I as xx xy xz yy yz zz).
 PLACE, INERTIA = 12, 10
-# Numbers of entries of a body's motion and of its subtree's loads; see `kernel.rnea`.
+# Numbers of entries of a body's motion and of its subtree's loads; see `kernel.bodies`.
 MOTION, LOAD = 30, 27
 
 
@@ -30,11 +29,12 @@ class Tree(
     namedtuple(
         "Tree",
         "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
-        "target share row depth path common entries places own inertias packed scaled "
-        "diagonal square size",
+        "target share row depth path common driven wrench_body wrench input stored_body stored "
+        "stiffness damping entries places own inertias packed scaled diagonal square motion load "
+        "bias c columns lower held size",
     )
 ):
-    """Kinematic tree. Body 0 is the base; the coordinates 0 to 5 are the base's.
+    """Kinematic tree with its loads. Body 0 is the base; the coordinates 0 to 5 are the base's.
 
     Bodies are in Pinocchio's order, coordinates in state order. Fields of each body:
 
@@ -57,17 +57,17 @@ class Tree(
       the pair contributes, and the factor of the contribution. After the pairs of a body comes the
       first of the base's six entries in its row.
 
+    Fields of the loads:
+
+    - `driven`: the coordinate that each input drives, -1 for a body-fixed wrench.
+    - `wrench_body`, `wrench`, `input`: for each body-fixed input, its body, its unit wrench at the
+      body's joint, and its index.
+    - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta.
+    - `stiffness`, `damping`: the springs and dampers of the joints.
+
     `entries` is the number of entries of the packed M. The following fields are offsets of the
     parts of the work space, and `size` is the size of the work space.
     """
-
-
-class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
-    """Offsets of the arrays that follow the tree's arrays in the work space, and its size."""
-
-
-class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
-    """Body-fixed inputs (body, unit wrench at its joint, index), stored momenta, and springs."""
 
 
 # Each robot's tree is computed once, because robots do not change.
@@ -103,7 +103,8 @@ def _tree(robot: Robot) -> Tree | None:
         inertias[body, 1:4] = inertia.mass * inertia.lever
         inertias[body, 4:] = inertia.matrix()[PIN_ANGULAR, PIN_ANGULAR][np.triu_indices(3)]
     coordinate, factor = _coordinates(robot)
-    paths = _paths(6 + robot.n, parent, coordinate)
+    state, size = StateMap(robot), 6 + robot.n
+    paths = _paths(size, parent, coordinate)
     row = np.cumsum([0, *map(len, paths[:-1])])
     target, share = [], []
     for body in range(bodies - 1, 0, -1):
@@ -116,12 +117,21 @@ def _tree(robot: Robot) -> Tree | None:
             above = parent[above]
         target.append(row[coordinate[body]])
         share.append(factor[body])
-    size = 6 + robot.n
     # For each two coordinates, the number of coordinates that their paths have in common.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
-    entries = int(sum(map(len, paths)))
-    parts = bodies * PLACE, bodies * INERTIA, bodies * INERTIA
-    sizes = *parts, entries, entries, size, size * size
+    axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
+    wrench_body: list[int] = []
+    inputs: list[int] = []
+    wrenches: list[Array] = []
+    for joint, numbers, columns in actuation.wrench_columns:
+        turned = axes[joint - ROOT].T
+        wrench_body += [joint - ROOT] * len(numbers)
+        inputs += numbers.tolist()
+        wrenches += [np.r_[turned @ w[PIN_ANGULAR], turned @ w[PIN_LINEAR]] for w in columns.T]
+    entries, count = int(sum(map(len, paths))), len(inputs)
+    sizes = [bodies * PLACE, bodies * INERTIA, bodies * INERTIA, entries, entries, size]
+    sizes += [size * size, bodies * MOTION, bodies * LOAD, size, size, size * count]
+    sizes += [size * 2 * size, size * 6]
     return Tree(
         parent,
         fixed.ravel(),
@@ -130,22 +140,30 @@ def _tree(robot: Robot) -> Tree | None:
         np.array(turns),
         np.array(slides),
         inertias.ravel(),
-        np.array([place.rotation for place in places]),
+        axes,
         np.array(coordinate),
         np.array(factor),
-        _armature(model, coordinate, factor),
+        state.spread(np.eye(size)) ** 2 @ model.armature,
         np.array(target, dtype=np.intp),
         np.array(share, dtype=float),
         row,
         np.array([len(path) - 1 for path in paths]),
         np.array([index for path in paths for index in path]),
         common,
+        np.where(actuation.fixed.any(axis=0), np.abs(actuation.fixed).argmax(axis=0), -1),
+        np.array(wrench_body, dtype=np.intp),
+        np.array(wrenches).ravel(),
+        np.array(inputs, dtype=np.intp),
+        np.array([joint - ROOT for joint, _ in robot.stored_momentum], dtype=np.intp),
+        np.array([axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]).ravel(),
+        np.array(robot.springs.stiffness),
+        np.array(robot.springs.damping),
         entries,
         *np.cumsum([0, *sizes]).tolist(),
     )
 
 
-def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
+def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, float] | None:
     """Return the frame with z along a joint's axis, and its rotation and translation per unit."""
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
@@ -173,17 +191,6 @@ def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
         at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
     moved = [at[joint.idx_v] for joint in robot.model.joints.tolist()[ROOT + 1 :]]
     return [5, *(index for index, _ in moved)], [1.0, *(factor for _, factor in moved)]
-
-
-def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> Array:
-    """Return, for each coordinate, the rotor inertia that its joints add to the diagonal of M."""
-    of_joints = model.armature
-    armature = np.zeros(1 + max(coordinate))
-    armature[:3], armature[3:6] = of_joints[PIN_ANGULAR], of_joints[PIN_LINEAR]
-    joints = model.joints.tolist()[ROOT + 1 :]
-    for joint, index, share in zip(joints, coordinate[1:], factor[1:], strict=True):
-        armature[index] += share**2 * of_joints[joint.idx_v]
-    return armature
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
@@ -217,36 +224,3 @@ def work_space(size: int) -> Array:
     # The kernel's vectors have 64 bytes. Access is faster if they are aligned to 64 bytes.
     first = -(space.ctypes.data // 8) % LANES
     return space[first : first + size * LANES].reshape(size, LANES)
-
-
-def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
-    """Return the loads of a robot: body-fixed inputs, stored momenta and springs."""
-    body: list[int] = []
-    inputs: list[int] = []
-    wrenches: list[Array] = []
-    for joint, numbers, columns in actuation.wrench_columns:
-        turned = tree.axes[joint - ROOT].T
-        for number, column in zip(numbers.tolist(), columns.T, strict=True):
-            body.append(joint - ROOT)
-            inputs.append(number)
-            wrenches.append(
-                np.concatenate((turned @ column[PIN_ANGULAR], turned @ column[PIN_LINEAR]))
-            )
-    stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
-    return Loads(
-        np.array(body, dtype=np.intp),
-        np.array(wrenches).ravel(),
-        np.array(inputs, dtype=np.intp),
-        np.array([index for index, _ in stored], dtype=np.intp),
-        np.array([tree.axes[index].T @ h for index, h in stored]).ravel(),
-        np.array(robot.springs.stiffness),
-        np.array(robot.springs.damping),
-    )
-
-
-def layout_of(tree: Tree, carried: int) -> Layout:
-    """Return the layout of the work space for a tree and a number of body-fixed inputs."""
-    size, bodies = len(tree.row), len(tree.parent)
-    bodily = bodies * MOTION, bodies * LOAD
-    sizes = *bodily, size, size, size * carried, size * 2 * size, size * 6
-    return Layout(*(tree.size + np.cumsum([0, *sizes])).tolist())

@@ -5,30 +5,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.rotation import skew
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, instance, share
+from fflin.base.validation import Array, frozen, instance, share
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_same, sensed
-from fflin.linear.model import LinearModel
-from fflin.linear.verification import (
-    ErrorDynamics,
-    Nonlinear,
-    aba_route,
-    compare,
-    difference_steps,
-    flow_error,
-    inertia_matrix,
-    inertia_residual,
-    inverse_inertia,
-    jacobian,
-    mobilities,
-    scaled_condition,
-    speeds,
-)
+from fflin.linear.fit import require_fit, require_sensed
+from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.nonlinear import Nonlinear, jacobian
+from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -68,6 +59,11 @@ _ROUTE_SAFETY = 10.0
 # Largest tolerance, even for an ill-conditioned M. With a larger one, the check would confirm
 # fewer than two digits.
 _LOOSEST = 1e-2
+
+# Terms that cancel exactly still leave rounding errors of 1e-16 of their size. Errors are
+# therefore relative to a scale that includes this fraction of such terms. It allows for the
+# rounding errors and hides no larger ones.
+_ROUNDING_FRACTION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,8 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
         raise InputError(
             f"the model is sampled at dt = {lin.dt:g} s; check the continuous-time model instead"
         )
-    return held_to(tolerance, _checked(Aba(StateMap(robot, frame=lin.frame)), lin))
+    found = _checked(robot, lin)
+    return found if tolerance is None else held_to(tolerance, found)
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
@@ -186,132 +183,275 @@ def held_to(tolerance: float | None, found: Check) -> Check:
     return Check(rows, f"{found.title}, each error at most {tolerance:.1e}")
 
 
-def _checked(aba: Aba, lin: LinearModel) -> Check:
-    robot, state, actuation = aba.state.robot, aba.state.about(lin.reference), aba.actuation
-    made = f"the model was made for '{lin.robot}'"
-    states, inputs = (lin.state_names, lin.state_units), (lin.input_names, lin.input_units)
-    require_same(made, robot, "state", states, (state.names, state.units))
-    require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
-    M = inertia_matrix(robot, lin, state)
-    condition = scaled_condition(M)
-    route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
-    difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin, aba)
-    A, B, inverse = aba_route(state, aba, q, v, lin.u0, moving=lin.moving)
-    chart = state.chart(q)
-    base_M = state.to_base(chart, state.to_base(chart, M).T).T
-    # If links are far apart, ABA loses digits that M retains. ABA's derivatives are as inaccurate
-    # as its M^-1, and the error of M^-1 is the residual of M M^-1 = I.
-    own_error = inertia_residual(base_M, inverse)
-    by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
-    rows = [
-        Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
-    ]
-    (steps, input_steps), nx = difference_steps(state, lin, M), state.nx
-    # Only over the attitude and the joint positions does f have terms beyond second order.
-    bends = np.zeros(nx + len(input_steps), dtype=bool)
-    bends[state.groups.q_b] = bends[state.groups.q_m] = True
-    point, every = np.concatenate((lin.x0, lin.u0)), np.concatenate((steps, input_steps))
-    derivatives = jacobian(
-        lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends
-    )
-    A, B, rounding = derivatives[:, :nx], derivatives[:, nx:], _STEP_ULPS * _EPS / difference
-    rows += [
-        Row("differences", *block, difference)
-        for block in compare(state, actuation, lin, M, A, B, steps=steps, rounding=rounding)
-    ]
-    rows += _output_rows(model, lin, (steps, input_steps), difference)
-    rows.append(Row("flow", "f", flow_error(model, lin), difference))
-    rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
-    rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
-    # With the default inputs, M^-1 is the lower half of B.
-    inverse = lin.B[-len(M) :] if actuation.default else inverse_inertia(state, lin)
-    rows.append(Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route))
-    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
-    scaled = scale[:, None] * inverse * scale
-    asymmetry = float(np.abs(scaled - scaled.T).max())
-    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
-    rows.append(Row("inertia", "M^-1 symmetric", asymmetry, 1e-12))
-    rows.append(Row("inertia", "M^-1 positive", max(0.0, -least), 1e-12))
-    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
-
-
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
     """Check many models; return the largest ratio of error to tolerance in each row of errors."""
     worst: dict[tuple[str, str], Row] = {}
-    aba: Aba | None = None
     for lin in models:
-        aba = aba or Aba(StateMap(robot, frame=lin.frame))
-        for row in _checked(aba, lin).rows:
+        for row in _checked(robot, lin).rows:
             before = worst.setdefault((row.test, row.block), row)
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 worst[row.test, row.block] = row
     return Check(tuple(worst.values()), title)
 
 
-def _point_errors(
-    model: Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
-) -> list[tuple[str, float]]:
-    """Return the errors of x0 and of each state group of f0.
+def _checked(robot: Robot, lin: LinearModel) -> Check:
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    require_fit(lin, robot, state, whole=True)
+    require_sensed(lin, robot, state)
+    q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
+    aba, M, rows = Aba(state), inertia_matrix(robot, lin), list[Row]()
+    A, B, aba_inverse = aba_route(aba, q, v, lin.u0, moving=lin.moving)
+    scales = Scales(aba, lin, M, B)
 
-    Errors of f0 are relative to the largest terms that may cancel within a state group.
-    """
-    state = model.state
-    mobility, input_mobility = mobilities(M, lin.B)
-    rate = model(lin.x0, lin.u0)
-    # In orbit, the terms that cancel contain the inertial velocity.
-    field = state.field
-    _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
-    push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
-    push += rate_of_turn**2 * float((1.0 / mobility).max())
-    push += rate_of_turn * momentum * float(mobility.max())
-    natural = np.concatenate((np.ones(len(M)), mobility * push))
-    errors = [("x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)))]
-    for name, rows in state.groups._asdict().items():
-        floor = float(natural[rows].max(initial=0.0)) or float(np.abs(rate[rows]).max(initial=1.0))
-        errors.append((f"f0[{name}]", _relative(lin.f0[rows], rate[rows], floor=floor or 1.0)))
-    return errors
+    condition = scaled_condition(M)
+    route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
+    difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
+    # If links are far apart, ABA loses digits that M retains. ABA's derivatives are as inaccurate
+    # as its M^-1, and the error of M^-1 is the residual of M M^-1 = I.
+    own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
+    by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
+    for block, error in scales.errors(A, B).items():
+        rows.append(Row("ABA derivatives", block, error, by_aba))
+
+    model, nx, steps = Nonlinear(aba, lin), state.nx, scales.difference_steps()
+    point = np.concatenate((lin.x0, lin.u0))
+    # Only over the attitude and the joint positions does f have terms beyond second order.
+    bends = np.zeros(len(point), dtype=bool)
+    bends[state.groups.q_b] = bends[state.groups.q_m] = True
+    slopes = jacobian(model.rates, point, steps, bends)
+    rounding = _STEP_ULPS * _EPS / difference
+    errors = scales.errors(slopes[:, :nx], slopes[:, nx:], steps=steps[:nx], rounding=rounding)
+    for block, error in errors.items():
+        rows.append(Row("differences", block, error, difference))
+    rows += _output_rows(model, lin, steps, difference)
+    rows.append(Row("flow", "f", model.flow_error(), difference))
+
+    x0 = state.to_state(q, v, near=lin.x0)
+    rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
+    rate, sizes = model.rates(point[None])[0], scales.rates()
+    for name, part in state.groups._asdict().items():
+        size = max(_largest(sizes[part]) or 1.0, _largest(rate[part]))
+        error = _largest(lin.f0[part] - rate[part]) / size
+        rows.append(Row("point", f"f0[{name}]", error, route))
+
+    # With the default inputs, M^-1 is the lower half of B.
+    inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
+    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
+    scaled = scale[:, None] * inverse * scale
+    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
+    rows += [
+        Row("inertia", "M", _largest(lin.M - M) / _largest(M), route),
+        Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route),
+        Row("inertia", "M^-1 symmetric", float(np.abs(scaled - scaled.T).max()), 1e-12),
+        Row("inertia", "M^-1 positive", max(0.0, -least), 1e-12),
+    ]
+    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
 
 
-def _output_rows(
-    model: Nonlinear, lin: LinearModel, steps: tuple[Array, Array], tolerance: float
-) -> list[Row]:
+def _output_rows(model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float) -> list[Row]:
     """Compare C, D and y0 with differences of the nonlinear outputs; return the rows."""
-    state = model.state
-    outputs = (lin.output_names, lin.output_units)
-    require_same(
-        f"the model was made for '{lin.robot}'", state.robot, "output", outputs, sensed(state)
-    )
+    state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
-        errors = (lin.y0 - lin.x0, lin.C - np.eye(state.nx), lin.D)
-        return [
-            Row("outputs", name, float(np.abs(error).max()), tolerance)
-            for name, error in zip(("y0", "C", "D"), errors, strict=True)
-        ]
-    measuring = Measuring(state, lin.q)
+        errors = {"y0": lin.y0 - lin.x0, "C": lin.C - np.eye(nx), "D": lin.D}
+    else:
+        measuring, point = Measuring(state, lin.q), np.concatenate((lin.x0, lin.u0))
 
-    def y(x: Array, u: Array) -> Array:
-        return measuring(x, *model.acceleration(x, u))
+        def y(z: Array) -> Array:
+            _, q, v, a = model.accelerations(z)
+            return np.array([measuring(*each) for each in zip(z[:, :nx], q, v, a, strict=True)])
 
-    step_x, step_u = steps
-    here = y(lin.x0, lin.u0)
-    of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
-    C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
-    D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
-    # A derivative is noise if it is smaller than the rounding error of y divided by the step.
-    scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
-    rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
-    for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):
-        size = np.maximum(
-            np.abs(expected).max(axis=1, initial=0.0)[:, None], _EPS * scale / step / tolerance
-        )
-        error = float((np.abs(given - expected) / size).max(initial=0.0))
-        rows.append(Row("outputs", name, error, tolerance))
+        here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
+        errors = {"y0": (lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
+        # A derivative is noise if it is smaller than the rounding error of y divided by the step.
+        noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
+        for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
+            largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
+            errors[name] = (given - slopes[:, part]) / np.maximum(largest, noise[:, part])
+    rows = []
+    for name, error in errors.items():
+        rows.append(Row("outputs", name, _largest(error), tolerance))
     return rows
 
 
-def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
-    if not given.size:
-        return 0.0
-    return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
+def certify(robot: Robot, lin: LinearModel) -> Certificate:
+    """Return the residuals of a continuous-time model of this robot."""
+    aba = Aba(StateMap(robot, reference=lin.reference, frame=lin.frame))
+    A, B, _ = aba_route(aba, lin.q, lin.v, lin.u0, moving=lin.moving)
+    errors = Scales(aba, lin, lin.M, B).errors(A, B)
+    return Certificate(
+        condition=scaled_condition(lin.M),
+        inertia_residual=inertia_residual(lin.M, inverse_inertia(aba.state, lin)),
+        route_A=max(error for name, error in errors.items() if name[0] == "A"),
+        route_B=max(error for name, error in errors.items() if name[0] == "B"),
+        f0=float(np.abs(lin.f0).max()),
+    )
+
+
+def scaled_condition(M: Array) -> float:
+    """Return the condition number of M scaled to a unit diagonal."""
+    scale = 1.0 / np.sqrt(M.diagonal())
+    return float(np.linalg.cond(scale[:, None] * M * scale))
+
+
+def inertia_residual(M: Array, inverse: Array) -> float:
+    """Return the largest entry of ``M M^-1 - I`` with M scaled to a unit diagonal."""
+    scale = np.sqrt(M.diagonal())
+    residual = M @ inverse - np.eye(len(M))
+    return float(np.abs(residual * scale / scale[:, None]).max())
+
+
+def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
+    """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    upper = pin.crba(robot.model, robot.create_data(), lin.q)
+    return frozen(_in_frame(state, lin.q, state.project(upper.T)))
+
+
+def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
+    """Return M^-1 (6 + n, 6 + n) at the point of a linear model, in the frame's axes."""
+    nv = 6 + state.robot.n
+    inverse: Array = np.empty((nv, nv))
+    Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
+    return _in_frame(state, lin.q, inverse)
+
+
+def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
+    """Transform M or its inverse (6 + n, 6 + n) from base axes to the axes of the frame."""
+    chart = state.chart(q)
+    return state.to_frame(chart, state.to_frame(chart, matrix).T).T
+
+
+def aba_route(
+    aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
+) -> tuple[Array, Array, Array]:
+    """Return A and B from ABA's derivatives by (4.9) and (15.3), and M^-1 by ABA."""
+    state = aba.state
+    own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
+    u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
+    # Pinocchio differentiates about the world's origin, and a base far from it would cost digits.
+    # So the base is placed at the origin: no derivative depends on its position, not even in
+    # orbit.
+    at_origin = q.copy()
+    at_origin[:3] = 0.0
+    by_q, by_v, by_u = aba.slopes(at_origin, v, u)
+    there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
+    # Upper half of A: kinematics of the tangent displacement in axes that rotate with the base.
+    A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
+    A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
+    A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
+    A[:nv, nv:] = np.eye(nv)
+    A[nv:], B[nv:] = np.hstack((by_q, by_v)), by_u
+    A = (there.P @ (A + B @ there.H) + there.rate) @ there.left
+    return A, there.P @ B @ there.V, aba.inverse
+
+
+class Scales:
+    """Sizes of the terms of a model at its point, to which the errors of A and B are relative.
+
+    M (6 + n, 6 + n) and B (nx, nu) are independent of the matrices of the model.
+    """
+
+    def __init__(self, aba: Aba, lin: LinearModel, M: Array, B: Array) -> None:
+        self._state = state = aba.state
+        self._inputs, self._lin, self._nv = aba.actuation.groups, lin, len(M)
+        # In orbit, the terms that cancel contain the inertial velocity.
+        self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
+        # sqrt((M^-1)_ii) (6 + n,), and sqrt(b^T M^-1 b) (nu,) for the force b of each input.
+        self._mobility = np.sqrt(np.linalg.inv(M).diagonal())
+        lower = B[-self._nv :]
+        inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
+        self._input_mobility = np.where(inputs > 0.0, inputs, 1.0)
+
+    def errors(
+        self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
+    ) -> dict[str, float]:
+        """Compare with other A and B; return the errors of blocks such as "A[q_b, q_m]".
+
+        `steps` (nx,) are the steps of the differences by which A and B were computed, and
+        `rounding` is the rounding error of these differences.
+        """
+        # Errors are relative to the largest entry of a block. Rows of accelerations are divided by
+        # the mobility, so that a light joint does not hide a heavy one. Columns of B are divided by
+        # the mobility of their input. If large terms cancel in a block, errors are relative to
+        # these terms, because the terms' rounding errors remain in the differences.
+        state, lin, nv = self._state, self._lin, self._nv
+        terms = self._cancelling_terms(self._v)
+        if steps is not None:
+            there = self._cancelling_terms(np.abs(self._v) + state.spread(steps[-nv:]))
+            terms = np.maximum(terms, rounding * there)
+        row_scale = np.concatenate((np.ones(nv), self._mobility))[:, None]
+        column_scale = np.where(np.arange(2 * nv)[:, None] < nv, 1.0, self._input_mobility)
+        of_A, of_B = (lin.A - A) / row_scale, (lin.B - B) / row_scale / column_scale
+        own, groups, errors = lin.A / row_scale, state.groups._asdict(), dict[str, float]()
+        for i, (row, rows) in enumerate(groups.items()):
+            for j, (column, columns) in enumerate(groups.items()):
+                size = max(_largest(own[rows, columns]), float(terms[i, j])) or 1.0
+                errors[f"A[{row}, {column}]"] = _largest(of_A[rows, columns]) / size
+            for column, inputs in self._inputs.items():
+                errors[f"B[{row}, {column}]"] = _largest(of_B[rows, inputs])
+        return errors
+
+    def _cancelling_terms(self, v: Array) -> Array:
+        """Return the size (6, 6) of the terms that may cancel, for each block of the scaled A."""
+        # The base's linear velocity counts only through the rounding errors that it causes in
+        # Pinocchio's derivatives.
+        mobility, lin = self._mobility, self._lin
+        speed, rate, momentum = self._speeds(v)
+        # Gyroscopic torque of the wheels on a rotating link, in the units of the rows.
+        spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
+        slowed = speed.copy()
+        slowed[LINEAR] *= _ROUNDING_FRACTION
+        resting, unit = slowed / mobility, 1.0 / mobility
+        accelerations = _largest(lin.f0[-self._nv :] / mobility)
+        forces = _largest(lin.u0 * self._input_mobility)
+        terms: Array = np.zeros((6, 6))
+        terms[:3, :3] = _largest(speed[:6])
+        terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
+        # Effect of a unit velocity at the present rates; for rotations, also at the present speed
+        # of the base.
+        turning = rate * np.array(
+            [_largest(unit[ANGULAR]), _largest(unit[LINEAR]), _largest(unit[6:])]
+        )
+        turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
+        terms[3:, 3:] = turning
+        terms[:, 0] *= _largest(self._state.chart(lin.q).J)
+        return terms
+
+    def _speeds(self, v: Array) -> tuple[Array, float, float]:
+        """Return speeds (6 + n,) with wheels at 0, the largest rate, and the wheels' momentum."""
+        speed, robot = np.abs(self._state.velocities(v)), self._state.robot
+        momentum = 0.0
+        for i, name in enumerate(robot.joint_names, 6):
+            if name in robot.wheels:
+                momentum += robot.wheels[name] * float(speed[i])
+                speed[i] = 0.0
+        for _, stored in robot.stored_momentum:
+            momentum += float(np.linalg.norm(stored))
+        return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
+
+    def rates(self) -> Array:
+        """Return the sizes (nx,) of the largest terms of f0, which may cancel."""
+        mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
+        push = _largest(self._lin.u0 * self._input_mobility)
+        push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)
+        return np.concatenate((np.ones(self._nv), mobility * push))
+
+    def difference_steps(self) -> Array:
+        """Return the steps (nx + nu,) for differences in x and u at the model's point."""
+        state, lin, nv = self._state, self._lin, self._nv
+        # The step is small compared with the rotations over which the accelerations of aligned
+        # light links change.
+        step = np.full(2 * nv, 2e-4)
+        # The step stays well inside the chart: f becomes steep near the limit |q_b| = 1.
+        step[state.groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[state.groups.q_b]))
+        # f is quadratic in the velocities and linear in the inputs, so there is no truncation error
+        # at any step size.
+        speed = np.abs(lin.x0[-nv:])
+        step[-nv:] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
+        step[state.groups.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
+        push = max(1.0, _largest(lin.f0[-nv:] / self._mobility)) / self._input_mobility
+        return np.concatenate((step, push))
+
+
+def _largest(x: Array) -> float:
+    return float(np.abs(x).max(initial=0.0))

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
 from fflin.base.validation import Array, FrozenArrays, Mask
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ORBITAL, forces_of
-from fflin.dynamics.orbital import field_of
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -162,11 +160,11 @@ def equilibrium(
     """
     state = StateMap(robot, frame=frame, reference=reference)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
-    axes: Any = {"moving": True}
     if robot.orbit:  # reference at the base, so that forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
-        axes = {"frame": frame, "reference": own}
-    linearizer = Linearizer(robot, **axes)
+        linearizer = Linearizer(robot, frame=frame, reference=own)
+    else:
+        linearizer = Linearizer(robot, moving=True)
     actuation, pushes = Actuation(state), forces_of(robot)
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])
@@ -182,7 +180,17 @@ def equilibrium(
         tolerance = np.maximum(tolerance, balance.tolerance)
     left = np.where(soft & ~loose, 0.0, balance.left)
     if float(np.linalg.norm(left)) > balance.allowed:
-        raise _unbalanced(robot, balance.residual, np.abs(left), pushes)
+        sizes, named = np.abs(left), list(pushes.items())
+        forces = [
+            f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
+            for i in np.argsort(-sizes)  # the largest effect first
+            if sizes[i] > 1e-6 * sizes.max()
+        ]
+        raise EquilibriumError(
+            f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
+            f"forces: {listed(forces)}; add inputs that balance these forces (thrusters cannot "
+            "pull), or choose another point"
+        )
     at, u = balance.lin.q, balance.u
     if reference is not None or robot.orbit:
         chart = state.chart(at)
@@ -204,7 +212,14 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        rounding, wanted = _rounding(robot, lin, M), -M @ acceleration
+        # Bounds (6 + n,) of the rounding errors that cancelling terms leave in the forces.
+        state, springs = linearizer.prepared.map, robot.springs
+        absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
+        speed = np.abs(state.velocities(absolute))
+        rounding = max(speed[:3].max(), speed[6:].max(initial=0.0)) * (np.abs(M) @ speed)
+        farthest = np.abs(state.joint_positions(lin.q)) + np.abs(springs.rest)
+        rounding[6:] += springs.stiffness * farthest
+        rounding, wanted = _ROUNDING * rounding, -M @ acceleration
         wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
         one_sided = np.zeros(len(actuation.names), dtype=bool)
         one_sided[actuation.groups.get("thrust", [])] = True
@@ -254,35 +269,6 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     else:
         return
     raise EquilibriumError(f"the motion of '{lin.robot}' is not steady under any input: {reason}")
-
-
-def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
-    """Return bounds of the rounding errors (6 + n,) that cancelling terms leave in the forces."""
-    state = StateMap(robot)
-    field = field_of(robot, lin.frame)
-    speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
-    rate = max(float(speed[:3].max()), float(speed[6:].max(initial=0.0)))
-    terms = rate * (np.abs(M) @ speed)
-    stiffness, _, rest = robot.springs
-    terms[6:] += stiffness * (np.abs(state.joint_positions(lin.q)) + np.abs(rest))
-    return _ROUNDING * terms
-
-
-def _unbalanced(
-    robot: Robot, residual: Array, sizes: Array, pushes: dict[str, str]
-) -> EquilibriumError:
-    """Build the error that names the residual forces, the largest effect first."""
-    named = list(pushes.items())
-    left = [
-        f"{named[i][0]} {residual[i]:.3g} {named[i][1]}"
-        for i in np.argsort(-sizes)
-        if sizes[i] > 1e-6 * sizes.max()
-    ]
-    return EquilibriumError(
-        f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-        f"forces: {listed(left)}; add inputs that balance these forces (thrusters cannot pull), "
-        "or choose another point"
-    )
 
 
 _EPS = float(np.finfo(float).eps)

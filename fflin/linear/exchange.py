@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.record import Design
@@ -138,7 +138,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     rate: Array = to.P @ rates
     x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
     fields: dict[str, Any] = {"C": np.eye(len(A)), "D": np.zeros(B.shape), "y0": x0}
-    outputs, about = states, "moving" if lin.moving else "fixed"
+    outputs = states
     if lin.output_names != lin.state_names:
         D = lin.D @ np.linalg.inv(own.V)
         fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
@@ -149,9 +149,9 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
-    T_u = np.linalg.solve(to.V, own.V)
     for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
+    T_u, about = np.linalg.solve(to.V, own.V), "moving" if lin.moving else "fixed"
     fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
     fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
     return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
@@ -255,21 +255,25 @@ def from_tool(
     True
     """
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
-    options: Any = {"frame": frame, "reference": reference, "moving": moving}
-    lin, step = linearize(robot, q, v, **options), _step(tool, dt)
+    about = partial(linearize, robot, q, v, frame=frame, reference=reference, moving=moving)
+    lin, step = about(), _step(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
         _, own, to, _ = _jacobians_at(robot, lin, tool)
-        lin = linearize(robot, q, v, np.linalg.solve(own.V, to.V @ u), **options)
+        lin = about(np.linalg.solve(own.V, to.V @ u))
     if A is None and B is None:
         return lin
     _, own, to, rates = _jacobians_at(robot, lin, tool)
     ours = transformed(own, to, lin.A, lin.B)
     ours = _euler_step(*ours, to.P @ rates, step)[:2] if step else ours
-    changes = [_difference(*each) for each in zip("AB", (A, B), ours, strict=True)]
-    if step:  # only the rows of rates count: the rows of positions follow from them
-        nv = len(ours[0]) // 2
-        changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
+    changes = []
+    for name, given, expected in zip("AB", (A, B), ours, strict=True):
+        change = expected if given is None else shaped(name, given, expected.shape)
+        change = change - expected
+        if step:  # only the rows of rates count: the rows of positions follow from them
+            nv = len(change) // 2
+            change = np.vstack((0.0 * change[:nv], change[nv:] / step))
+        changes.append(change)
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
     A, B = (
         np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
@@ -322,9 +326,3 @@ def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array
     A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
     A[:nv, :nv] += K
     return A, B, np.concatenate((moved, h * a))
-
-
-def _difference(name: str, given: ArrayLike | None, expected: Array) -> Array:
-    """Return the caller's matrix minus the expected matrix, or zeros if no matrix is given."""
-    array = expected if given is None else shaped(name, given, expected.shape)
-    return np.asarray(array - expected)

@@ -22,13 +22,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
-from fflin.base.errors import FflinError, FileError, InputError, listed, require_known
+from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, vector
 from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Frame, frame_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -245,13 +244,11 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         entries, verified = _columns(source) if table else read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
-    try:
+    with located(str(source)):
         entries = _entries(entries, robot) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
         frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
         return arguments(entries, robot, hold, frame, verified)
-    except FflinError as error:
-        raise type(error)(f"{source}: {error}") from None
 
 
 def arguments(
@@ -270,11 +267,13 @@ def arguments(
     u = u[:, None] if u.ndim == 1 else u
     names, there = actuation.names, texts(entries.get("input_names", actuation.names))
     if names != there or u.shape[-1] != len(names):
-        extra = [name for name in there if name not in names]
+        lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
+        said = f"; it lacks the inputs {listed(lacking)}" if lacking else ""
+        said += f"; it has the other inputs {listed(other)}" if other else ""
         raise InputError(
-            f"the file has {u.shape[-1]} inputs{f', such as {extra[0]}' if extra else ''}, "
-            f"expected one for each input of the robot: {listed(names)}; load the robot with the "
-            "inputs of the trajectory (--inputs)"
+            f"the file has {u.shape[-1]} inputs, expected one for each input of the robot, in the "
+            f"order {listed(names)}{said}; load the robot with the inputs of the trajectory "
+            "(--inputs)"
         )
     for columns in actuation.held:
         # Inputs in reference axes are rotated to world axes.

@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, vector
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Measuring, Sensing
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin import Gain, GainBatch
 
 # Names of signals, and their units in the same order.
 Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 
 
-def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` if a model's states or inputs differ from the robot's."""
+def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
+    """Raise `InputError` if a model's states or inputs differ from the robot's.
+
+    A reduced model may lack states of the robot, unless the model must be `whole`.
+    """
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
-    # A reduced model may lack states of the robot, so only its own states are compared.
-    units = dict(zip(state.names, state.units, strict=True))
-    there = tuple(name for name in lin.state_names if name in units)
-    states = (lin.state_names, lin.state_units)
-    require_same(made, robot, "state", states, (there, tuple(units[name] for name in there)))
+    there = state.names, state.units
+    if not whole:
+        units = dict(zip(*there, strict=True))
+        names = tuple(name for name in lin.state_names if name in units)
+        there = names, tuple(units[name] for name in names)
+    require_same(made, robot, "state", (lin.state_names, lin.state_units), there)
     require_turns(made, len(lin.q), robot)
 
 
@@ -48,17 +54,18 @@ def sensed(state: StateMap) -> Signals:
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
     """Raise `InputError` if names or units differ from the robot's; the message lists them."""
-    mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
-    lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
-    if names := lacking or beside:
-        said = "lacks" if lacking else "also has"
-        said += f" the {kind}{'s' * bool(names[1:])} {listed(names)}"
-    elif other := [name for name in mine if mine[name] != others[name]]:
-        said = f"has its {kind} {other[0]} in {others[other[0]]}, not {mine[other[0]]}"
-    elif own != there:
-        said = f"has its {kind}s in another order"
-    else:
+    if own == there:
         return
+    mine, others = dict(zip(*own, strict=True)), dict(zip(*there, strict=True))
+    names = [n for n in mine if n not in others] or [n for n in others if n not in mine]
+    changed = [name for name in mine if mine[name] != others.get(name)]
+    if names:
+        said = "lacks" if names[0] in mine else "also has"
+        said += f" the {kind}{'s' * bool(names[1:])} {listed(names)}"
+    elif changed:
+        said = f"has its {kind} {changed[0]} in {others[changed[0]]}, not {mine[changed[0]]}"
+    else:
+        said = f"has its {kind}s in another order"
     subject = made.partition(" was ")[0]
     raise InputError(
         f"{made}, but the given robot '{robot.name}' {said}; make {subject} again for the given "
@@ -138,7 +145,7 @@ def outputs(
     return Measuring(state, lin.q)(x, at, moving, a)
 
 
-def line_up(gain: Any, lin: LinearModel) -> Array:
+def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
     """Return the matrix K of a gain for another model, with states and inputs matched by name.
 
     Use `line_up` to keep a gain after a change of the robot, such as a jammed joint or a captured
@@ -181,19 +188,16 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
                 f"the {key} of the gain is {own}, but the {key} of the model is {other}; give "
                 f"both the same {key}"
             )
-    at = []
+    selections = []
     for kind in ("input", "state"):
         own, other = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
-        lacking, beside = ([n for n in a if n not in b] for a, b in ((own, other), (other, own)))
+        lacking, beside = [n for n in own if n not in other], [n for n in other if n not in own]
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
                 f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
                 f"the model or the gain must have all {kind}s of the other"
             )
-        common = [name for name in other if name in own]
-        at.append(([other.index(name) for name in common], [own.index(name) for name in common]))
-    (rows, own_rows), (columns, own_columns) = at
-    K = np.zeros((*gain.K.shape[:-2], len(lin.input_names), len(lin.state_names)))
-    K[..., np.array(rows)[:, None], columns] = gain.K[..., np.array(own_rows)[:, None], own_columns]
-    return K
+        selections.append(np.array([[float(a == b) for b in own] for a in other]))
+    of_inputs, of_states = selections
+    return np.asarray(of_inputs @ gain.K @ of_states.T)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -14,15 +12,13 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit, unknown_frame
-from fflin.dynamics.orbital import mean_motion
+from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
+from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel
-from fflin.linear.state_equations import assemble, at_rest, drift, output_equations
-from fflin.linear.verification import certify, inertia_matrix
+from fflin.linear.state_equations import assemble, drift, output_equations
 from fflin.robot.fields import magnitudes_of
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import require_inertia, rotor_names
@@ -37,40 +33,112 @@ if TYPE_CHECKING:
     from fflin.kernel.derivatives import RowAccelerations
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Data that all points of linearisation of a robot share; arrays are read-only."""
+_STANDING: Chart = Standing()
 
-    robot: Robot
-    map: StateMap
-    actuation: Actuation
-    sensing: Sensing | None  # None if the outputs are the state
-    moving: bool
-    own_reference: bool  # whether the reference is the base placement at each point
-    reference: Array  # (7,) reference of `map`: position [m] and quaternion x, y, z, w
-    free: bool  # whether `common` and `rest` contain all of a model at rest except M^-1
-    common: Mapping[str, Any]  # fields of a model that are the same at all points
-    rest: Mapping[str, Array]  # A, f0, u0 and v of a model at rest without any forces
+
+class Prepared:
+    """Data that all points of linearisation of a robot share; arrays are read-only.
+
+    Arguments and errors are as in `Linearizer`.
+
+    Attributes
+    ----------
+    robot : Robot
+    map : StateMap
+    actuation : Actuation
+    sensing : Sensing or None
+        None if the outputs are the state.
+    moving : bool
+    own_reference : bool
+        Whether the reference is the base placement at each point.
+    free : bool
+        Whether `common` and `rest` contain all of a model at rest except M^-1.
+    common : dict
+        Fields of a model that are the same at all points.
+    rest : dict
+        A, f0, u0 and v of a model at rest without any forces.
+    """
+
+    def __init__(
+        self, robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
+    ) -> None:
+        self.robot, self.moving = robot, truth("moving", moving)
+        if moving:
+            refuse_orbit(robot, "models with moving=True")
+        frame = "local" if moving and frame is None else frame
+        self.map = state = StateMap(robot, reference=reference, frame=frame)
+        if moving and (reference is not None or state.frame != "local"):
+            raise InputError(
+                "moving=True measures the error in the axes of the moving base, so no reference "
+                "and no frame other than 'local' can be given; leave out reference and frame"
+            )
+        # In orbit, the reference is the orbital frame.
+        self.own_reference = reference is None and robot.orbit is None
+        require_inertia(robot)
+        self.actuation = Actuation(state)
+        self.sensing: Sensing | None = None
+        if robot.outputs != (FullState(),):
+            from fflin.dynamics.outputs import Sensing
+
+            self.sensing = Sensing(state, robot.outputs, own_reference=self.own_reference)
+        acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
+        self.free = self.sensing is None and not moving and not acts
+        nx, nv, nu = state.nx, state.nx // 2, len(self.actuation.names)
+        self.common: dict[str, Any] = {
+            "C": frozen(np.eye(nx)),
+            "D": frozen(np.zeros((nx, nu))),
+            "dt": 0.0,
+            "frame": state.frame,
+            "moving": self.moving,
+            "robot": robot.name,
+            "urdf_sha256": robot.urdf_sha256,
+            "locked": robot.locked,
+            "fflin_version": __version__,
+            "pinocchio_version": pin.__version__,
+            "_inertia": partial(inertia_matrix, robot),
+            "_certify": partial(certify, robot),
+            "_ignorable": partial(ignorable_states, robot),
+            "_limits": partial(magnitudes_of, robot),
+            "weights": robot.weights,
+            "mean_motion": robot.orbit.mean_motion if robot.orbit else 0.0,
+            "_robot": robot,
+        }
+        signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
+        for signal, of in signals:
+            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
+        A = np.zeros((nx, nx))
+        A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))  # N (2.1)
+        self.rest: dict[str, Array] = {
+            "A": frozen(A),
+            "f0": frozen(np.zeros(nx)),
+            "u0": frozen(np.zeros(nu)),
+            "v": frozen(np.zeros(robot.nv)),
+        }
 
     @cached_property
+    def reference(self) -> Array:
+        """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
+        return frozen(pin.SE3ToXYZQUAT(self.map.reference))
+
+    @property
     def fields(self) -> dict[str, Any]:
         """Fields of a model at rest except B and q; slow ones are computed at their first use."""
-        state = partial(_state_at, self)
-        asked = {"x0": state, "y0": state, "_reference": partial(own_reference, self.robot)}
-        other = {} if self.own_reference else {"_reference": self.reference}
-        return {**self.common, **self.rest, "_computed": asked, **other}
+        asked = {
+            "x0": self._state_at,
+            "y0": self._state_at,
+            "_reference": partial(own_reference, self.robot),
+        }
+        fields = {**self.common, **self.rest, "_computed": asked}
+        if not self.own_reference:
+            fields["_reference"] = self.reference
+        return fields
 
-    def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; raise `InputError` if they are not available."""
-        from fflin.kernel.derivatives import RowAccelerations
-        from fflin.kernel.tree import batch_tree
-
-        tree, reason = batch_tree(self.robot), self.not_compilable
-        if tree is None or reason:
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
-        return RowAccelerations(self.map, self.actuation, tree)
+    def _state_at(self, lin: LinearModel) -> Array:
+        state, q = self.map, lin.q
+        chart, r_b = _STANDING, _STANDING.q_b
+        if not self.own_reference:
+            chart, r_b = state.chart(q), state.positions(q)
+        return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
 
     @property
     def not_compilable(self) -> str:
@@ -84,95 +152,24 @@ class Prepared:
             return f"'{name}' is in orbit"
         return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
 
+    def kernel(self) -> RowAccelerations:
+        """Return the compiled accelerations; raise `InputError` if they are not available."""
+        from fflin.kernel.derivatives import RowAccelerations
+        from fflin.kernel.tree import batch_tree
 
-def prepare(
-    robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
-) -> Prepared:
-    """Prepare a robot; arguments and errors are as in `Linearizer`."""
-    moving = truth("moving", moving)
-    if moving:
-        refuse_orbit(robot, "models with moving=True")
-    if frame is None:
-        frame = "local" if moving else None
-    elif not isinstance(frame, str):  # such as an array, which cannot be compared below
-        raise unknown_frame(frame)
-    if moving and (reference is not None or frame != "local"):
-        raise InputError(
-            "moving=True measures the error in the axes of the moving base, so no reference and "
-            "no frame other than 'local' can be given; leave out reference and frame"
-        )
-    state = StateMap(robot, reference=reference, frame=frame)
-    own = reference is None and robot.orbit is None  # in orbit the reference is the orbit frame
-    require_inertia(robot)
-    actuation = Actuation(state)
-    sensing = None
-    if robot.outputs != (FullState(),):
-        from fflin.dynamics.outputs import Sensing
-
-        sensing = Sensing(state, robot.outputs, own_reference=own)
-    acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
-    nu = len(actuation.names)
-    seen = sensing or state
-    return Prepared(
-        robot=robot,
-        map=state,
-        actuation=actuation,
-        sensing=sensing,
-        moving=moving,
-        own_reference=own,
-        reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
-        free=sensing is None and not moving and not acts,
-        common={
-            "C": frozen(np.eye(state.nx)),
-            "D": frozen(np.zeros((state.nx, nu))),
-            "dt": 0.0,
-            "state_names": state.names,
-            "input_names": actuation.names,
-            "output_names": seen.names,
-            "state_units": state.units,
-            "input_units": actuation.units,
-            "output_units": seen.units,
-            "frame": state.frame,
-            "moving": moving,
-            "robot": robot.name,
-            "urdf_sha256": robot.urdf_sha256,
-            "locked": robot.locked,
-            "fflin_version": __version__,
-            "pinocchio_version": pin.__version__,
-            "_inertia": partial(inertia_matrix, robot),
-            "_certify": partial(certify, robot),
-            "_ignorable": partial(ignorable_states, robot),
-            "_limits": partial(magnitudes_of, robot),
-            "weights": robot.weights,
-            "mean_motion": mean_motion(robot),
-            "_robot": robot,
-        },
-        rest={
-            "A": frozen(at_rest(state)),
-            "f0": frozen(np.zeros(state.nx)),
-            "u0": frozen(np.zeros(nu)),
-            "v": frozen(np.zeros(robot.nv)),
-        },
-    )
-
-
-def _state_at(ready: Prepared, lin: LinearModel) -> Array:
-    state, own = ready.map, ready.own_reference
-    chart, r_b = (_STANDING, _STANDING.q_b) if own else (state.chart(lin.q), state.positions(lin.q))
-    x0 = state.compose(chart, r_b, state.joint_positions(lin.q), state.velocities(lin.v))
-    return frozen(x0)
+        if reason := self.not_compilable:
+            raise InputError(
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
+            )
+        tree = batch_tree(self.robot)
+        assert tree is not None
+        return RowAccelerations(self.map, self.actuation, tree)
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
     """Return the base placement (7,) at a model's point, which is the default reference."""
-    q = lin.q
-    root = robot.model.jointPlacements[ROOT]
-    if root.isIdentity(0.0):
-        return q[:7]
-    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
-
-
-_STANDING: Chart = Standing()
+    root, q = robot.model.jointPlacements[ROOT], lin.q[:7]
+    return q if root.isIdentity(0.0) else frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
 
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
@@ -180,11 +177,9 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # The ignorable coordinates depend on the robot, not on the point. The position is ignorable
     # because uniform gravity is the same everywhere. Without gravity, the error dynamics do not
     # depend on the attitude either. In orbit, position and attitude both matter.
-    if robot.orbit:
-        return tuple(f"q_m.{name}" for name in rotor_names(robot))
-    groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
+    groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
-    return (*base, *(f"q_m.{name}" for name in rotor_names(robot)))
+    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in rotor_names(robot)))
 
 
 class Linearizer:
@@ -271,7 +266,7 @@ class Linearizer:
         reference: pin.SE3 | None = None,
         moving: bool = False,
     ) -> None:
-        self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
+        self.prepared = ready = Prepared(robot, frame=frame, reference=reference, moving=moving)
         self.robot = robot
         self._data = robot.create_data()
         self._lock = Lock()  # protects the work space
@@ -292,31 +287,26 @@ class Linearizer:
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
-        v = self._still[0] if v is None else robot.checked_velocity(v).copy()
-        if u is None:
-            u = self._still[1]
-        else:
-            u = vector("u", u, self._shape_B[1], "the robot's inputs").copy()
+        still_v, still_u = self._still
+        v = still_v if v is None else robot.checked_velocity(v).copy()
+        u = still_u if u is None else vector("u", u, len(still_u), "the robot's inputs").copy()
         with self._lock:
             if known:
-                return self._at_rest(q)
+                B = np.zeros(self._shape_B)
+                self._accelerations.invert(q, B[self._lower])
+                B.setflags(write=False)
+                q.setflags(write=False)
+                return LinearModel(self._fields, B=B, q=q)
             # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy needs its own work space, so it is built anew from the constructor's arguments.
-        ready = self.prepared
-        reference = None if ready.own_reference else ready.map.reference
-        options: dict[str, Any] = {"frame": ready.map.frame, "reference": reference}
-        return partial(type(self), **options, moving=ready.moving), (self.robot,)
-
-    def _at_rest(self, q: Array) -> LinearModel:
-        B = np.zeros(self._shape_B)
-        self._accelerations.invert(q, B[self._lower])
-        B.setflags(write=False)
-        q.setflags(write=False)
-        return LinearModel(self._fields, B=B, q=q)
+        state, moving = self.prepared.map, self.prepared.moving
+        reference = None if self.prepared.own_reference else state.reference
+        make = partial(type(self), frame=state.frame, reference=reference, moving=moving)
+        return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready, lower = self.prepared, self._lower
@@ -349,29 +339,24 @@ class Linearizer:
         """
         ready, lower, count = self.prepared, self._lower, len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
-        chart, nu, q_m = Standing(count), state.velocities(v), state.joint_positions(q)
+        chart, nu = Standing(count), state.velocities(v)
+        x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
         A, B = np.tile(ready.rest["A"], (count, 1, 1)), np.zeros((count, *self._shape_B))
-        ny = len(ready.common["output_names"])
-        x0 = state.compose(chart, chart.q_b, q_m, nu)
-        C, D, y = np.empty((count, ny, state.nx)), np.empty((count, ny, u.shape[1])), x0
-        if sensing is None:
-            C[:], D[:] = ready.common["C"], ready.common["D"]
-        else:
-            y = np.empty((count, ny))
-        c, gravity = np.empty_like(nu), np.empty((count, 3))
+        c, gravity, seen = np.empty_like(nu), np.empty((count, 3)), []
         with self._lock:
-            for k in range(count):
-                slopes, by_u = A[k, lower], B[k, lower]
-                rates = self._accelerations.rates(q[k], v[k], nu[k], u[k], slopes, by_u)
+            for k, point in enumerate(zip(q, v, nu, u, strict=True)):
+                rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
-                    point = (q[k], v[k], nu[k], u[k])
-                    seen = output_equations(
-                        sensing, actuation, self._data, _STANDING, rates, x0[k], point
-                    )
-                    C[k], D[k], y[k] = seen["C"], seen["D"], seen["y0"]
+                    here = _STANDING, rates, x0[k], point
+                    seen.append(output_equations(sensing, actuation, self._data, *here))
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
         f0 = assemble(state, actuation, chart, nu, u, all_rates, A, moving=ready.moving)
+        if sensing is None:
+            C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
+            y = x0
+        else:
+            C, D, y = (np.array([each[key] for each in seen]) for key in ("C", "D", "y0"))
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)
         return {"A": A, "B": B, "C": C, "D": D, "y": y}

@@ -12,19 +12,10 @@ import pinocchio as pin
 
 from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.dynamics.state import StateMap
-
-
-def at_rest(state: StateMap) -> Array:
-    """Return A (nx, nx) at rest without forces, with N in its upper right block (2.1)."""
-    nv = state.nx // 2
-    A: Array = np.zeros((state.nx, state.nx))
-    A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))
-    return A
+from fflin.dynamics.state import Actuation, StateMap
 
 
 def assemble(
@@ -40,9 +31,9 @@ def assemble(
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B at one or many points; return f0 (.., nx).
 
-    On entry, the upper half of A is the upper half of `at_rest`. `rates.slopes` is a view of the
-    lower half of A, and `rates.by_u` a view of the lower half of B. Both are converted in place
-    from base axes to the chart and the frame.
+    On entry, the upper half of A is as at rest, with N in the right block (2.1). `rates.slopes` is
+    a view of the lower half of A, and `rates.by_u` a view of the lower half of B. Both are
+    converted in place from base axes to the chart and the frame.
     """
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
@@ -53,7 +44,7 @@ def assemble(
     theta = _over_rotations(state, actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Rows of attitude and position. At the reference, the other blocks are as in `at_rest`.
+    # Rows of attitude and position. At the reference, the other blocks are as at rest.
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:

@@ -11,9 +11,8 @@ import fflin.base.rotation as turning
 from fflin.base.errors import ChartError, InputError, unknown
 from fflin.base.rotation import quaternion_product, skew
 from fflin.base.validation import NORM_TOLERANCE, Array, placement, vector
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 

@@ -13,18 +13,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, as_double, frozen, number, shaped, vector
+from fflin.base.validation import Array, Indices, as_double, frozen, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 
@@ -131,18 +130,23 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        short = np.shape(self.u) == (count - 1, nu) and self.hold != "linear"
+        q, v, u = (
+            _configurations(robot, self.q, count),
+            as_double("v", self.v),
+            as_double("u", self.u),
+        )
+        short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
-        u = shaped("u", self.u, (count - short, nu), hint)
-        q, v = _configurations(robot, self.q, count), shaped("v", self.v, (count, robot.nv))
+        u = np.vstack((u, u[-1:])) if short else u
+        for name, rows, size, more in (("v", v, robot.nv, ""), ("u", u, nu, hint)):
+            if rows.shape != (count, size):
+                raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
         for k, t in enumerate(times):
-            try:
+            with located(f"at t = {t:g} s"):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
-            except FflinError as error:
-                raise InputError(f"at t = {t:g} s: {error}") from None
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v)}
-        values["u"] = frozen(np.vstack((u, u[-1:])) if short else u)
+                vector("u", u[k], nu, "the robot's inputs")
+        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
         values["hold"] = self.hold or ("previous" if short else "linear")
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -207,11 +211,10 @@ class Trajectory(Design):
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,); see `point`."""
         k, s = intervals_of(self.t, times)
-        powers, (turns, speeds) = s[:, None] ** np.arange(4), self.cubics
-        steps = np.einsum("ij,ijk->ik", powers, turns[k])
+        s = s[:, None]
+        steps, v = np.einsum("ij,lijk->lik", s ** np.arange(4), self.cubics[:, k])
         q = integrate_rows(self.robot.model, self.q[k], steps)
-        u = self._in_base_axes(q, self._input(k, s[:, None]))
-        return q, np.einsum("ij,ijk->ik", powers, speeds[k]), u
+        return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
         """Return the inputs in the axes of `frame`, at a fraction of the intervals k."""
@@ -296,11 +299,9 @@ class Trajectory(Design):
         target = as_path(path)
         if type(self) is Trajectory and target.suffix == ".csv":
             write_csv(target, self)
-        elif type(self) is Trajectory:
+        else:
             record = record_of(self) | {"input_names": list(self.actuation.names)}
             write_record(target, record, checksummed=self.verified)
-        else:
-            super().save(target)
 
     @staticmethod
     def load(  # type: ignore[override]
@@ -341,10 +342,8 @@ class Trajectory(Design):
 
         source = as_path(path)
         values = read(source, robot, hold, frame)
-        try:
+        with located(str(source)):
             return Trajectory(robot, **values)
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from None
 
     def _within(self, t: float) -> float:
         t = number("t", t)
@@ -426,8 +425,8 @@ class Trajectory(Design):
         return q, v
 
     @cached_property
-    def cubics(self) -> tuple[Array, Array]:
-        """Coefficients (N - 1, 4, nv) of v and of the displacement from each interval's start."""
+    def cubics(self) -> Array:
+        """Coefficients (2, N - 1, 4, nv) of the displacement within each interval, and of v."""
         q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
         begin = self._aba.accelerations(q, v, self.u_base)
         end = begin[1:]
@@ -444,10 +443,8 @@ class Trajectory(Design):
             pin.dDifference(model, *pair, pin.ArgumentPosition.ARG1) @ speed
             for pair, speed in zip(pairwise(q), v[1:], strict=True)
         ]
-        return (
-            cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes),
-            cubic(v[:-1], v[1:], h * begin[:-1], h * end),
-        )
+        displacement = cubic(np.zeros_like(apart), apart, h * v[:-1], h * slopes)
+        return np.array((displacement, cubic(v[:-1], v[1:], h * begin[:-1], h * end)))
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
@@ -469,10 +466,9 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
     """Return the indices (k,) of the intervals that contain times (k,), and elapsed fractions."""
-    last = len(t) - 2
-    k = np.maximum(np.minimum(t.searchsorted(times, "right") - 1, last), 0)
+    k = t[1:-1].searchsorted(times, "right")
     fraction = (times - t[k]) / (t[k + 1] - t[k])
-    ends = (fraction > 1.0 - _NEAR) & (k < last)
+    ends = (fraction > 1.0 - _NEAR) & (k < len(t) - 2)
     fraction[ends | (fraction < _NEAR)] = 0.0
     return k + ends, np.minimum(fraction, 1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,7 +20,7 @@ from fflin.robot.inputs import (
     named_wheels,
     three_numbers,
 )
-from fflin.robot.joints import Find, by_joint
+from fflin.robot.joints import by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
 
@@ -33,50 +33,35 @@ if TYPE_CHECKING:
 # Least and largest value; infinite without a limit.
 Range: TypeAlias = tuple[float, float]
 
-_OF_JOINTS = ("q_m", "qdot_m")
-
 RULES = ("urdf", "identity")
-_STATE = ("joints", "rpy", "position", "velocity")
-_WEIGHTS = ("rule", "q", "r", "bryson")
 
 
-def checked_fields(fields: Mapping[str, object], robot: Robot) -> dict[str, Any]:
-    """Return the checked fields of `Robot.replace`, except for passive joints and inputs."""
-    require_known("field of a robot", fields, FIELDS)
-    return {name: FIELDS[name](value, robot) for name, value in fields.items()}
-
-
-def checked_inputs(
-    value: object, find: Find, joints: Sequence[str], passive: Sequence[str]
-) -> tuple[Input, ...]:
-    """Check inputs, and return them with one joint torque for each joint of a pattern."""
+def checked_inputs(value: object, bare: Robot, passive: Sequence[str]) -> tuple[Input, ...]:
+    """Check inputs of a robot without equipment; a pattern becomes a torque of each joint."""
     if isinstance(value, str) or not isinstance(value, Sequence) or not value:
         raise InputError(f"inputs is {value!r}, expected a sequence of at least one input")
+    inputs: list[Input] = []
     for item in value:
         if not isinstance(item, Input):
             known = ", ".join(kind.__name__ for kind in kinds.KINDS)
             raise InputError(f"{item!r} is not an input; expected {known}")
-    value = [one for item in value for one in _spread(item, find, joints, passive)]
-    if not value:
+        if not isinstance(item, JointTorque):
+            inputs.append(item)
+            continue
+        found = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
+        if item.joint in found and item.joint in passive:
+            raise InputError(
+                f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+                "from passive, or the torque from the inputs"
+            )
+        inputs += [replace(item, joint=name) for name in found if name not in passive]
+    if not inputs:
         raise InputError("all inputs are torques of passive joints; add an input that is not")
-    names = [name for item, own in named_inputs(value) for name in own]
+    names = [name for _, own in named_inputs(inputs) for name in own]
     for each in names:
         if names.count(each) > 1:
             raise InputError(f"input '{each}' is given twice; remove one of them")
-    return tuple(value)
-
-
-def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[str]) -> list[Input]:
-    """Return a joint torque for each joint with a motor that matches the name or pattern."""
-    if not isinstance(item, JointTorque):
-        return [item]
-    found = by_joint({str(item.joint): None}, joints, find)
-    if item.joint in found and item.joint in passive:
-        raise InputError(
-            f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
-            "from passive, or the torque from the inputs"
-        )
-    return [replace(item, joint=name) for name in found if name not in passive]
+    return tuple(inputs)
 
 
 def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
@@ -97,15 +82,13 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
     # A limit for all joints does not apply to wheels, because wheels are much faster.
-    wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
-    whole = {key: of_states.pop(key) for key in _OF_JOINTS if key in of_states}
+    wheels = {f"{of}.{name}" for of in ("q_m", "qdot_m") for name, _ in named_wheels(inputs)}
+    whole = {key: of_states.pop(key) for key in {"q_m", "qdot_m"} & of_states.keys()}
     found = by_name("input or state", whole, (*keys, *states))
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
     found |= by_name("input or state", of_states, (*keys, *states))
     found |= by_name("input", of_inputs, keys)
-    return {
-        names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
-    }
+    return {names[i]: (max(low, floors[i]), max(up, floors[i])) for i, (low, up) in found.items()}
 
 
 def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
@@ -121,91 +104,91 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     return tuple(found)
 
 
-def _rest(value: object, robot: Robot) -> dict[str, float]:
-    return by_joint(numbers("rest", value, "joint", "rest of joint"), robot.own_joints, robot.joint)
+def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
+    """Return {joint: value} of all joints except wheels and modes, where names are exact."""
+    found = numbers(what, value, "joint", f"{what} of joint")
+    return by_joint(found, robot.own_joints, robot.joint)
 
 
-def _stiffness(value: object, robot: Robot, what: str = "stiffness") -> dict[str, float]:
-    """Return {joint: value} from a mapping, or from one value for all joints except wheels."""
-    if not isinstance(value, Mapping):
-        value = dict.fromkeys(robot.own_joints, value)
-    checked = numbers(what, value, "joint", f"{what} of joint")
-    for name, entry in checked.items():
+def _coefficients(what: str, value: object, robot: Robot) -> dict[str, float]:
+    """Return the stiffness or damping {joint: value} from a mapping, one value or "urdf"."""
+    if isinstance(value, str) and what == "damping":
+        if value != "urdf":
+            raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: d}}")
+        return dict(robot.urdf_damping)
+    many = value if isinstance(value, Mapping) else dict.fromkeys(robot.own_joints, value)
+    found = _of_joints(what, many, robot)
+    for name, entry in found.items():
         if entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
-    return by_joint(checked, robot.own_joints, robot.joint)
+    return found
 
 
-def _damping(value: object, robot: Robot) -> dict[str, float]:
-    if not isinstance(value, str):
-        return _stiffness(value, robot, "damping")
-    if value != "urdf":
-        raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}")
-    return dict(robot.urdf_damping)
-
-
-def range_of(name: str, value: Any) -> Range:
+def range_of(name: str, value: object) -> Range:
     """Return (least, largest) from this pair or from one magnitude."""
-    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
-        least, largest = (number(f"limit of '{name}'", x) for x in value)
+    what = f"limit of '{name}'"
+    bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
+    if len(bounds) == 2:
+        least, largest = (number(what, x) for x in bounds)
     else:
-        largest = number(f"limit of '{name}'", value)
+        largest = number(what, value)
         least = -largest
     if least > largest:
         raise InputError(
-            f"limit of '{name}' is {value}, expected a largest magnitude of at least 0, or bounds "
-            "(least, largest)"
+            f"{what} is {value}, expected a largest magnitude of at least 0, or bounds (least, "
+            "largest)"
         )
     return least, largest
 
 
-def _state(what: str, value: object, robot: Robot) -> dict[str, Any]:
+def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
     """Check a point, start or target of a robot, and replace patterns by the names of joints."""
-    state = _parts(what, value, _STATE)
+    state = _parts(what, value, ("joints", "rpy", "position", "velocity"))
     if "joints" in state:
         values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
         state["joints"] = by_joint(values, robot.joint_names, robot.joint)
-    for name in ("rpy", "position"):
-        if name in state:
-            state[name] = three_numbers(f"{what} {name}", state[name])
+    for name in {"rpy", "position"} & state.keys():
+        state[name] = three_numbers(f"{what} {name}", state[name])
     if "velocity" in state:
         rates = numbers(f"{what} velocity", state["velocity"], "name", f"{what} velocity")
         state["velocity"] = rates_by_name(robot.joint_names, rates)
     return state
 
 
-def _weights(value: object, robot: Robot) -> dict[str, Any]:
+def _weights(value: object, robot: Robot) -> dict[str, object]:
     """Check the weights of a robot's regulator; the keys are names of states and inputs."""
-    weights = _parts("weights", value, _WEIGHTS)
-    require_known("rule of weights", [str(weights.get("rule", RULES[0]))], RULES)
-    states, keys = state_keys(robot.joint_names), _input_keys(robot.inputs)
-    parts = {
-        "q": ("state", states),
-        "r": ("input", keys),
-        "bryson": ("state or input", (*states, *keys)),
-    }
-    for part, (kind, names) in parts.items():
-        weights[part] = numbers(part, weights.get(part, {}), "name", f"{part} of")
-        for key, entry in weights[part].items():
-            matching(kind, key, names)
+    states, inputs = state_keys(robot.joint_names), _input_keys(robot.inputs)
+    kinds = {"q": states, "r": inputs, "bryson": (*states, *inputs)}
+    given = _parts("weights", value, ("rule", *kinds))
+    weights: dict[str, object] = {}
+    if "rule" in given:
+        require_known("rule of weights", [str(given["rule"])], RULES)
+        weights["rule"] = given["rule"]
+    weighed, bounded = set[str](), set[str]()
+    for part, names in kinds.items():
+        entries = numbers(part, given.get(part, {}), "name", f"{part} of")
+        for key, entry in entries.items():
+            matching({"q": "state", "r": "input"}.get(part, "state or input"), key, names)
             if entry < 0.0 or (part != "q" and not entry):
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
-    for key in weights["bryson"].keys() & (weights["q"].keys() | weights["r"].keys()):
+        (bounded if part == "bryson" else weighed).update(entries)
+        weights |= {part: entries} if entries else {}
+    for key in weighed & bounded:
         raise InputError(f"'{key}' has both a weight and a largest value; give only one of them")
-    return {part: value for part, value in weights.items() if value}
+    return weights
 
 
-def checked_passive(value: object, find: Find, joints: Sequence[str]) -> tuple[str, ...]:
+def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
     """Return the joints without a motor, in the order of the state."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
-    found = by_joint(dict.fromkeys(keys), joints, find)
-    return tuple(name for name in joints if name in found)
+    found = by_joint(dict.fromkeys(keys), bare.joint_names, bare.joint)
+    return tuple(name for name in bare.joint_names if name in found)
 
 
-def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
+def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
     if not isinstance(value, Mapping):
         raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
     require_known(f"part of {what}", value, known)
@@ -213,20 +196,18 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, Any]:
 
 
 # Checks of the fields, in the order in which a file applies them: inputs come before the fields
-# that refer to their names.
-FIELDS: dict[str, Callable[[Any, Robot], object]] = {
+# that refer to their names. `Robot.replace` itself checks the first three.
+FIELDS: dict[str, Callable[[object, Robot], Any]] = {
     **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
     "outputs": _outputs,
-    "stiffness": _stiffness,
-    "damping": _damping,
-    "rest": _rest,
+    "stiffness": partial(_coefficients, "stiffness"),
+    "damping": partial(_coefficients, "damping"),
+    "rest": partial(_of_joints, "rest"),
     "gravity": lambda value, _: three_numbers("gravity", value),
     "orbit": lambda value, _: checked_orbit(value),
     "limits": lambda value, robot: given_limits(robot.inputs, robot.joint_names, value),
     "weights": _weights,
-    "point": partial(_state, "point"),
-    "target": partial(_state, "target"),
-    "start": partial(_state, "start"),
+    **{name: partial(_state, name) for name in ("point", "target", "start")},
 }
 
 
@@ -266,12 +247,12 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
+def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[str, Range]]:
     """Return the saturation limits of the inputs for `simulate`, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
-    for part in limits if several else [limits]:
+    for part in limits if isinstance(limits, list | tuple) and several else [limits]:
         if isinstance(part, str):
             if part != "urdf":
                 raise InputError(

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
@@ -70,7 +70,7 @@ class Input:
         `count` numbers the inputs of one type; the default names of thrusters and wheels contain
         this number.
         """
-        return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
+        return tuple(map(f"{self.GROUP}.{{}}".format, self.ENTRIES))
 
 
 class WrenchInput(Input, ABC):
@@ -207,10 +207,7 @@ class Thruster(WrenchInput):
         if (impulse := self.least_impulse) is not None:
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
         self._set("position", three_numbers("thruster position", self.position))
-        self._set(
-            "direction",
-            unit_vector("thruster direction", self.direction, "the direction of its force"),
-        )
+        self._set("direction", unit_vector("thruster direction", self.direction))
 
     @property
     def wrench(self) -> Array:
@@ -279,7 +276,7 @@ class ReactionWheel(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("axis", unit_vector("wheel axis", self.axis, "the direction it turns about"))
+        self._set("axis", unit_vector("wheel axis", self.axis))
         self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
             self._set("max_speed", positive("wheel max_speed", self.max_speed, "rad/s"))
@@ -302,21 +299,22 @@ class ReactionWheel(WrenchInput):
 KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, ReactionWheel)
 
 
-def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
+def three_numbers(what: str, value: object) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` with the given value."""
+    entries = value if isinstance(value, Iterable) else ()
     try:
-        x, y, z = (number(what, entry) for entry in value)
-    except (TypeError, ValueError):
+        x, y, z = (number(what, entry) for entry in entries)
+    except ValueError:
         raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
     return x, y, z
 
 
-def unit_vector(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
+def unit_vector(what: str, value: object) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
     x, y, z = three_numbers(what, value)
     length = math.hypot(x, y, z)
     if length == 0.0:
-        raise InputError(f"{what} is zero; give {hint}")
+        raise InputError(f"{what} is zero; give a direction")
     return x / length, y / length, z / length
 
 

@@ -67,7 +67,7 @@ class Joint(NamedTuple):
         omega = math.sqrt(stiffness / self.inertia)
         return omega, 0.5 * damping / (self.inertia * omega)
 
-    def place(self, q: Array, value: float) -> None:
+    def place(self, q: Array, value: float | Array) -> None:
         """Write this joint's value [rad|m|kg^0.5 m] into a configuration q (nq,)."""
         if self.unbounded:
             q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
@@ -109,7 +109,7 @@ Find: TypeAlias = Callable[[str], Joint]
 
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
     """Return {joint: value} from {joint or pattern: value}; ``q_m`` stands for all joints."""
-    return joints_by_name("joint", values, joints, lambda name: find(name).name)
+    return joints_by_name("joint", values, joints, find)
 
 
 class Carried(NamedTuple):
@@ -157,12 +157,12 @@ class Coordinates:
     _as_made: tuple[pin.Model, pin.Model] | None
     _removed: tuple[str, ...]
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints, in state order."""
         return tuple(joint.name for joint in self.joints)
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of independent joints."""
         return len(self.joints)
@@ -186,7 +186,8 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        self.follow(q)
+        for follower in self.followers:
+            follower.place(q)
         return q
 
     def follow(self, q: Array) -> None:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,12 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, ModelError
 from fflin.base.validation import instance, is_rotation
 from fflin.base.writing import remember
-from fflin.robot.catalog import RobotFile, find_mesh, find_robot, folders
+from fflin.robot.catalog import find_mesh, find_robot, folders
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic, is_impossible
-from fflin.robot.urdf.reader import Advice, read_urdf
+from fflin.robot.urdf.reader import read_urdf
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 
@@ -78,45 +79,22 @@ def load(
     >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
     8
     """
-    found = find_robot(robot)
-    if found.path.suffix.lower() != ".toml":
-        loaded, advice = _load(found, lock, folders(package_dirs))
-    else:
+    found, dirs = find_robot(robot), folders(package_dirs)
+    first = None if lock is None else requested(lock)
+    later: dict[str, float | None] = {}
+    file = None
+    if found.path.suffix.lower() == ".toml":
         from fflin.robot.robot_files import RobotToml
 
         file = RobotToml(found.path, found.name)
-        later = {} if lock is None else requested(lock)
-        first = {name: later.pop(name, value) for name, value in file.lock.items()}
-        with file.located_locks():
-            dirs = (*folders(package_dirs), *file.package_dirs)
-            loaded, advice = _load(file.found, first or None, dirs)
-        loaded = file.applied(loaded)
-        if later:
-            loaded = welded(loaded, later)
-    loaded = loaded.merged(fields)
-    gone = {name.rpartition("=")[0] for name in loaded.locked}
-    notes = [*loaded.notes]
-    for field, names, text in advice:
-        said = {*getattr(loaded, field, ()), *gone}
-        said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
-        if not {*names} <= said:
-            notes.append(text)
-    for note in notes:
-        warnings.warn(note, FflinWarning, stacklevel=2)
-    if loaded.idle_coordinates:
-        # Add a note instead of a warning, because every function that inverts M raises an error
-        # anyway.
-        notes.append(massless_note(loaded))
-    return replace(loaded, notes=tuple(notes))
-
-
-def _load(
-    found: RobotFile, lock: Lock | None, package_dirs: tuple[Path, ...]
-) -> tuple[Robot, tuple[Advice, ...]]:
-    """Return the robot of a URDF, and warnings that fields of the robot can resolve."""
+        later, first = first or {}, None
+        found, dirs = file.found, (*dirs, *file.package_dirs)
+        if file.lock:
+            first = {name: later.pop(name, value) for name, value in file.lock.items()}
     urdf = read_urdf(found.path)
-    loaded = _robot(urdf.model, found.name, lock, urdf.mimics)
-    dirs = (*package_dirs, *found.package_dirs)
+    with file.document.located("lock") if file and first else nullcontext():
+        loaded = _robot(urdf.model, found.name, first, urdf.mimics)
+    dirs = (*dirs, *found.package_dirs)
     # Meshes are read only when the robot is drawn, so output files must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
     damping = {name: urdf.joints[name].damping for name in loaded.joint_names}
@@ -138,7 +116,26 @@ def _load(
         },
         file_joints=tuple(urdf.joints),
     )
-    return loaded, urdf.advice
+    if file:
+        loaded = file.applied(loaded)
+    if later:
+        loaded = welded(loaded, later)
+    loaded = loaded.merged(fields)
+    # Fields of the robot resolve some warnings, if they name all joints of the warning.
+    gone = {name.rpartition("=")[0] for name in loaded.locked}
+    notes = [*loaded.notes]
+    for field, names, text in urdf.advice:
+        said = {*getattr(loaded, field, ()), *gone}
+        said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
+        if not {*names} <= said:
+            notes.append(text)
+    for note in notes:
+        warnings.warn(note, FflinWarning, stacklevel=2)
+    if loaded.idle_coordinates:
+        # Add a note instead of a warning, because every function that inverts M raises an error
+        # anyway.
+        notes.append(massless_note(loaded))
+    return replace(loaded, notes=tuple(notes))
 
 
 def from_model(
@@ -265,9 +262,7 @@ def _check_model(model: pin.Model, name: str) -> None:
             f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
         }
         for fault in (fault for fault, found in faults.items() if found):
-            raise ModelError(
-                f"'{name}': joint '{model.names[index]}' has {fault}; correct it in the model"
-            )
+            raise ModelError(f"'{name}': joint '{model.names[index]}' has {fault}; correct it")
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:

@@ -1,10 +1,12 @@
 r"""Mass of each link as in the URDF, changes of bodies, and motions that move no mass.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
-moments of its mass distribution are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The body is
-physically realisable if and only if m and Sigma are positive (semi)definite (Wensing, Kim and
-Slotine, Linear matrix inequalities for physically-consistent inertial parameter identification,
-IEEE Robotics and Automation Letters 3(1), 2018).
+moments of its mass distribution about c are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The
+pseudo-inertia P (4, 4) contains m, m c and the second moments about the origin,
+:math:`\Sigma + m c c^T`. It is linear in the mass distribution. The body is physically realisable
+if and only if P is positive semidefinite (Wensing, Kim and Slotine, Linear matrix inequalities for
+physically-consistent inertial parameter identification, IEEE Robotics and Automation Letters 3(1),
+2018).
 """
 
 from __future__ import annotations
@@ -40,6 +42,11 @@ _INVOLVED = 0.1
 
 # Relative asymmetry up to which a body counts as symmetric, for the rounding of numbers in a URDF.
 _ASYMMETRY = 1e-12
+
+
+def dynamic_parameters(model: pin.Model) -> bytes:
+    """Return the mass properties of all bodies, for a hash of the robot."""
+    return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
@@ -107,36 +114,45 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
     for index in range(ROOT, model.njoints):
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(checked.values()):
-            heavier, shift, wider = np.split(drawn, (1, 4), 1)
             body = model.inertias[index]
             # Root mean square distances [m] of the body's mass from its centre, per axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
-            heavier, shift = checked["mass"] * heavier, checked["com"] * shift * radii
-            mass, com, about = stretched(body, heavier, shift, checked["inertia"] * wider)
+            density, com = checked["mass"] * drawn[:, 0], checked["com"] * drawn[:, 1:4] * radii
+            wider = checked["inertia"] * drawn[:, 4:]
+            mass, com, about = _properties(_stretched(body, np.eye(3), density, com, wider))
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
 
 
-def stretched(
-    body: pin.Inertia, mass: Array, com: Array, inertia: Array
-) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of N variants of a body.
+def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inertia: Array) -> Array:
+    """Return the pseudo-inertias (N, 4, 4) of N variants of a body.
 
-    `mass` (N, 1) and `inertia` (N, 3) are relative changes. `com` (N, 3) [m] shifts the centre of
+    `density` (N,) and `inertia` (N, 3) are relative changes. `com` (N, 3) [m] shifts the centre of
     mass, and changes neither the mass nor the inertia about the centre. Shifts and changes of
-    inertia are along the axes of the body's frame.
+    inertia are along `axes`, which are the columns of a matrix (3, 3).
     """
-    # A body that is stretched by S along its axes has the second moments S Sigma S, which remain
-    # positive definite.
-    heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
-    second = 0.5 * np.trace(body.inertia) * unit - body.inertia
     # Some files contain physically impossible bodies, which are scaled equally along all axes.
-    sound = np.linalg.eigvalsh(second)[0] >= -_NO_MOMENT * np.trace(second)
-    stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
-    second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
-    about = np.trace(second, axis1=1, axis2=2)[:, None, None] * unit - second
-    return heavier * body.mass, body.lever + com, about
+    least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
+    if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
+        inertia = inertia[:, :1] * np.ones(3)
+    # The affine map T of the mass distribution makes T P T^T of P, which remains positive definite.
+    # T stretches the body about its centre of mass, and then shifts it.
+    T = np.zeros((len(com), 4, 4))
+    T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
+    T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever
+    T[:, 3, 3] = 1.0
+    P: Array = body.toPseudoInertia().toMatrix()
+    return (1.0 + density)[:, None, None] * (T @ P @ T.swapaxes(1, 2))
+
+
+def _properties(P: Array) -> tuple[Array, Array, Array]:
+    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of pseudo-inertias (N, 4, 4)."""
+    mass = P[:, 3, 3]
+    com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
+    second = P[:, :3, :3] - mass[:, None, None] * com[:, :, None] * com[:, None]
+    about = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    return mass, com, about
 
 
 class LinkMass(NamedTuple):
@@ -212,46 +228,23 @@ def as_inertia(piece: Piece) -> pin.Inertia:
     return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
 
 
-def varied(
-    piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
-) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a link, in its joint's frame.
+def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
+    """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one link.
 
     `mass` (N,), `density` (N,) and `inertia` (N, 3) are relative changes; `com` (N, 3) [m] shifts
-    the centre of mass. Changes of inertia and shifts are along the axes of the link.
+    the centre of mass. Changes of inertia and shifts are along the axes of the link. A change of
+    mass does not change the inertia about the centre of mass.
     """
-    R = piece.frame.rotation
-    own_axes = R.T @ piece.placement.rotation
-    about = own_axes @ piece.inertia @ own_axes.T
-    own = pin.Inertia(piece.mass, piece.frame.actInv(piece.placement.translation), about)
-    weight, centre, about = stretched(own, density, com, inertia)
-    return weight * (1.0 + mass), piece.frame.translation + centre @ R.T, R @ about @ R.T
+    body = as_inertia(piece)
+    after = _stretched(body, piece.frame.rotation, density, com, inertia)
+    center = np.concatenate((body.lever + com @ piece.frame.rotation.T, np.ones((len(com), 1))), 1)
+    added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
+    return after + added - body.toPseudoInertia().toMatrix()
 
 
-def with_changed(
-    body: pin.Inertia, changed: Iterable[tuple[Piece, tuple[Array, Array, Array]]]
-) -> tuple[Array, Array, Array]:
+def with_changed(body: pin.Inertia, changes: Iterable[Array]) -> tuple[Array, Array, Array]:
     """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body with changed links."""
-    total = _moments(np.array([body.mass]), body.lever[None], body.inertia[None])
-    for piece, properties in changed:
-        inertia = as_inertia(piece)
-        before = _moments(np.array([inertia.mass]), inertia.lever[None], inertia.inertia[None])
-        after = _moments(*properties)
-        total = tuple(x + a - b for x, a, b in zip(total, after, before, strict=True))
-    mass, first, second = total
-    com = first / np.where(mass == 0.0, 1.0, mass)[:, None]
-    return mass, com, second - mass[:, None, None] * _squares(com)
-
-
-def _moments(mass: Array, com: Array, inertia: Array) -> tuple[Array, ...]:
-    """Return masses, first moments and inertias about the joint."""
-    return mass, mass[:, None] * com, inertia + mass[:, None, None] * _squares(com)
-
-
-def _squares(com: Array) -> Array:
-    """Return the inertias (N, 3, 3) of unit masses at points (N, 3)."""
-    squares: Array = (com * com).sum(axis=1)[:, None, None] * np.eye(3)
-    return squares - com[:, :, None] * com[:, None]
+    return _properties(body.toPseudoInertia().toMatrix() + sum(changes))
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
 from fflin.base.errors import FflinWarning, InputError, require_known
-from fflin.base.validation import number, positive
+from fflin.base.validation import instance, number, positive
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
 BODIES = {
@@ -94,29 +94,24 @@ class CircularOrbit:
     body_radius: float = _FOLLOWS
 
     def __post_init__(self) -> None:
-        if not isinstance(self.body, str):
-            raise InputError(f"body is {self.body!r}, expected a name such as 'earth'")
+        instance("body", self.body, str, "a name such as 'earth'")
         if (self.mu is None) != (self.body_radius is None):
-            raise InputError(
-                "only one of mu and body_radius is given; give both values, or leave both out"
-            )
-        if self.mu is None:
-            require_known("central body", [self.body], BODIES)
-            mu, ground = BODIES[self.body]
-        else:
-            mu = positive("mu", self.mu)
-            ground = positive("body_radius", self.body_radius)
+            raise InputError("only one of mu and body_radius is given; give both or none")
         if (self.altitude is None) == (self.mean_motion is None):
             raise InputError(
                 f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
                 "give exactly one of them"
             )
-        n = self.mean_motion
-        if self.altitude is not None:
-            altitude = number("altitude", self.altitude)
+        if self.mu is None:
+            require_known("central body", [self.body], BODIES)
+            mu, ground = BODIES[self.body]
         else:
-            n = positive("mean_motion", n)
+            mu, ground = positive("mu", self.mu), positive("body_radius", self.body_radius)
+        if self.altitude is None:
+            n = positive("mean_motion", self.mean_motion)
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
+        else:
+            altitude = number("altitude", self.altitude)
         if not 0.0 < altitude < 1e15:
             raise InputError(
                 f"an altitude of {altitude:g} m over {self.body} is not an orbit; give an "
@@ -126,12 +121,9 @@ class CircularOrbit:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
             # Do not warn if `mu` is given: the orbit was saved, or "earth" names another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
-                warnings.warn(
-                    f"an altitude of {altitude:.8g} m over earth is too low for an orbit; "
-                    "altitudes are in metres, so write 400 km as 400e3",
-                    FflinWarning,
-                    stacklevel=3,
-                )
+                said = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
+                said += "; altitudes are in metres, so write 400 km as 400e3"
+                warnings.warn(said, FflinWarning, stacklevel=3)
         known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
         for name, value in known.items():
             object.__setattr__(self, name, value)

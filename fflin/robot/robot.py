@@ -12,17 +12,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, require_known, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, with_appendages
 from fflin.robot.equipment.mounting import stored_momentum
-from fflin.robot.fields import Range, checked_fields, checked_passive
+from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
 from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
+    dynamic_parameters,
     given_bodies,
     idle_coordinates,
     pieces_of,
@@ -243,18 +244,24 @@ class Robot(Coordinates):
         """Return a copy with other fields; joints and limits that are not named keep theirs."""
         if self.passive and isinstance(given := fields.get("passive"), list | tuple):
             fields = {**fields, "passive": [*self.passive, *given]}
-        return self._replaced({**fields}, merged=True)
+        return self._replaced(fields, merged=True)
 
-    def _replaced(self, fields: dict[str, object], *, merged: bool) -> Robot:
+    def _replaced(self, fields: Mapping[str, object], *, merged: bool) -> Robot:
         self.require_unchanged()
+        require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            robot = robot._without_motors(fields.pop("passive"))
+            passive = checked_passive(fields["passive"], self._bare)
+            inputs = [x for x in self.inputs if getattr(x, "joint", None) not in passive]
+            if not inputs:
+                raise InputError("all inputs are torques of passive joints; add another input")
+            robot = replace(self, passive=passive, inputs=tuple(inputs))
         if "inputs" in fields:
-            robot = equipped(robot, inputs=fields.pop("inputs"))
+            robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
-            robot = with_appendages(robot, fields.pop("appendages"))
-        checked = checked_fields(fields, robot)
+            robot = with_appendages(robot, fields["appendages"])
+        own = ("passive", "inputs", "appendages")
+        checked = {k: FIELDS[k](value, robot) for k, value in fields.items() if k not in own}
         # Without `merged`, only modes keep their values unless they are named.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
@@ -342,12 +349,8 @@ class Robot(Coordinates):
         model = bare.model.copy()
         for joint, body in bodies.items():
             model.inertias[joint] = body
-        masses, before = (
-            b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
-            for each in (model, bare.model)
-        )
-        digest = self.urdf_sha256
-        if masses != before:
+        digest, masses = self.urdf_sha256, dynamic_parameters(model)
+        if masses != dynamic_parameters(bare.model):
             digest = sha256(digest.encode() + masses).hexdigest()
         other = replace(bare, model=model, urdf_sha256=digest)
         if bare is self:
@@ -390,13 +393,7 @@ class Robot(Coordinates):
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
-    @cached_property
-    def idle_coordinates(self) -> tuple[str, ...]:
-        """Coordinates that make M singular, because they can move together without moving any mass.
-
-        Most robots have no such coordinates.
-        """
-        return idle_coordinates(self)
+    idle_coordinates = cached_property(idle_coordinates)
 
     @cached_property
     def wheels(self) -> dict[str, float]:
@@ -468,14 +465,3 @@ class Robot(Coordinates):
     def _bare(self) -> Robot:
         """The robot without its wheels and modes; itself if it has none."""
         return self._unequipped or self
-
-    def _without_motors(self, passive: object) -> Robot:
-        """Return the robot without the torque inputs of passive joints."""
-        bare = self._bare
-        joints = checked_passive(passive, bare.joint, bare.joint_names)
-        inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
-        if not inputs:
-            raise InputError(
-                "all inputs are torques of passive joints; a model needs at least one input"
-            )
-        return replace(self, passive=joints, inputs=inputs)

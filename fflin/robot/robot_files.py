@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
-from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
+from fflin.base.errors import InputError, UnknownNameError, unknown
 from fflin.base.toml_file import TomlFile, flat
 from fflin.robot.catalog import find_inputs, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
@@ -19,11 +18,10 @@ from fflin.robot.welding import requested
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
+T = TypeVar("T")
+
 # Fields that a TOML file writes as arrays of tables ([[input]]): {field: names of the arrays}.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
-
-# Tables of a robot file in which entries may be tables.
-_OF_PARTS = ("weights", "point", "target", "start")
 
 # Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
 KEYS = (
@@ -39,7 +37,7 @@ class RobotToml:
     """Content of a robot's TOML file, checked as far as possible without the robot."""
 
     def __init__(self, path: Path, name: str) -> None:
-        self._document = document = TomlFile(path)
+        self.document = document = TomlFile(path)
         check_keys(document)
         if "urdf" not in document.record:
             raise InputError(
@@ -53,42 +51,32 @@ class RobotToml:
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
         with document.located("package_dirs"):
             self.package_dirs = folders(document.record.get("package_dirs", ()), path.parent)
+        # Nested tables become names with dots, except for the parts of weights and states.
+        values = {
+            key: {part: _flat(x) for part, x in value.items()}
+            if key in ("weights", "point", "target", "start") and isinstance(value, dict)
+            else _flat(value)
+            for key, value in document.record.items()
+        }
         with document.located("lock"):
-            self.lock = requested(_flat("lock", document.record.get("lock", ())))
-        self._fields = {key: _flat(key, x) for key, x in document.record.items() if key in FIELDS}
+            self.lock = requested(values.get("lock", ()))
+        self._fields = {key: value for key, value in values.items() if key in FIELDS}
         if "input" in document.record:
             self._fields["inputs"] = read_inputs(document)
-        if appendages := read_appendages(document):
+        if appendages := _read_appendages(document):
             self._fields["appendages"] = appendages
 
     def applied(self, robot: Robot) -> Robot:
         """Return the robot with the file's fields."""
-        for key in FIELDS:
-            if key in self._fields:
-                tables = _TABLES.get(key, (key,))
-                with self._document.located(next(x for x in tables if x in self._document.record)):
-                    robot = robot.replace(**{key: self._fields[key]})
+        for key in filter(self._fields.__contains__, FIELDS):
+            tables = _TABLES.get(key, (key,))
+            with self.document.located(next(x for x in tables if x in self.document.record)):
+                robot = robot.replace(**{key: self._fields[key]})
         return robot
 
-    @contextmanager
-    def located_locks(self) -> Iterator[None]:
-        """Add file and line to errors that name a joint which the file locks."""
-        try:
-            yield
-        except FflinError as error:
-            if not any(f"'{name}'" in str(error) for name in self.lock):
-                raise
-            with self._document.located("lock"):
-                raise
 
-
-def _flat(key: str, value: object) -> Any:
-    """Return the value of a key as one flat table: nested keys are joined by dots."""
-    if not isinstance(value, dict):
-        return value
-    if key in _OF_PARTS:
-        return {part: flat(x) if isinstance(x, dict) else x for part, x in value.items()}
-    return flat(value)
+def _flat(value: object) -> object:
+    return flat(value) if isinstance(value, dict) else value
 
 
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
@@ -188,8 +176,7 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     return tuple(inputs)
 
 
-def read_appendages(document: TomlFile) -> list[Appendage]:
-    """Return the flexible appendages and slosh of a robot file."""
+def _read_appendages(document: TomlFile) -> list[Appendage]:
     found: list[Appendage] = []
     for key, make, special in (
         ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
@@ -201,7 +188,7 @@ def read_appendages(document: TomlFile) -> list[Appendage]:
             values = {**table}
             for name in {"op4", "asm"} & set(values):
                 values[name] = document.path.parent / str(values[name])
-            build = special if alone & set(values) else make
+            build: Callable[..., Appendage] = special if alone & set(values) else make
             found.append(_built(document, (key, index), build, values))
     return found
 
@@ -214,7 +201,9 @@ def _tables(document: TomlFile, key: str) -> list[dict[str, object]]:
     return tables
 
 
-def _built(document: TomlFile, table: tuple[str, int], build: Any, values: dict[str, Any]) -> Any:
+def _built(
+    document: TomlFile, table: tuple[str, int], build: Callable[..., T], values: dict[str, object]
+) -> T:
     """Build an object from a table; errors begin with file and line."""
     of, parameters = f"{table[0]} {table[1] + 1}: ", dict(signature(build).parameters)
     if isinstance(name := values.get("name"), str):

@@ -18,7 +18,7 @@ from fflin.robot.equipment.assembly import equipped
 from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
-from fflin.robot.mass_properties import LinkMass
+from fflin.robot.mass_properties import LinkMass, dynamic_parameters
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic
@@ -50,19 +50,14 @@ def welded(robot: Robot, lock: Lock) -> Robot:
         else each
         for each in robot.outputs
     ]
-    fields: dict[str, Any] = {
-        "locked": (*robot.locked, *locked),
-        "passive": tuple(name for name in robot.passive if name not in gone),
-        "outputs": tuple(x for x in outputs if getattr(x, "joints", None) != ()),
-    }
-    bare = replace(
-        bare,
-        model=model,
-        joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
-        followers=tuple(f.within(model) for f in bare.followers if f.joint.name in left),
-        **fields,
-    )
-    return equipped(replace(robot, **fields), bare, inputs=inputs)
+    locked = (*robot.locked, *locked)
+    passive = tuple(name for name in robot.passive if name not in gone)
+    kept = tuple(x for x in outputs if getattr(x, "joints", None) != ())
+    joints = tuple(joint.within(model) for joint in bare.joints if joint.name not in gone)
+    followers = tuple(f.within(model) for f in bare.followers if f.joint.name in left)
+    bare = replace(bare, model=model, joints=joints, followers=followers, locked=locked)
+    robot = replace(robot, locked=locked, passive=passive, outputs=kept)
+    return equipped(robot, bare, inputs=inputs)
 
 
 def locked_model(
@@ -71,11 +66,10 @@ def locked_model(
     """Weld joints and their mimic joints; return model, remaining mimic joints, welded joints."""
     movable = list(model.names)[ROOT + 1 :]
 
-    def found(name: str) -> str:
+    def find(name: str) -> None:
         require_known("joint to lock", [name], movable)
-        return name
 
-    given = joints_by_name("joint to lock", requested(lock), movable, found)
+    given = joints_by_name("joint to lock", requested(lock), movable, find)
     values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
         leader_value = values.get(mimic.leader, 0.0) or 0.0
@@ -97,17 +91,12 @@ def locked_model(
     return _reduced(model, indices, q), left, tuple(locked)
 
 
-def requested(lock: Any) -> dict[str, float | None]:
+def requested(lock: object) -> dict[str, float | None]:
     """Return locks as {joint or pattern: value}; the value None means the neutral position."""
-    try:
-        names = [lock] if isinstance(lock, str) else list(lock)
-    except TypeError:
-        names = [None]
+    names = [lock] if isinstance(lock, str) or not isinstance(lock, Iterable) else [*lock]
     if not all(isinstance(name, str) for name in names):
-        raise InputError(
-            f"lock has type {type(lock).__name__}, expected {{joint: value}} or names of joints"
-        )
-    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
+        raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
+    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(map(str, names))
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
@@ -157,11 +146,10 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         at_center = pin.SE3(np.eye(3), body.lever)
         both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
-    weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
     bare = replace(
         bare,
         model=model,
-        urdf_sha256=sha256(identity.encode() + weighed).hexdigest(),
+        urdf_sha256=sha256(identity.encode() + dynamic_parameters(model)).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
         followers=tuple(followers),
         links=both.pop("links"),
@@ -175,9 +163,7 @@ def _require_new_names(robot: Robot, prefix: str) -> None:
         raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
     taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
     if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
-        raise InputError(
-            f"'{robot.name}' already has joints or frames named '{prefix}'; give another prefix"
-        )
+        raise InputError(f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix")
 
 
 def _joined(
@@ -195,9 +181,7 @@ def _joined(
         parts.append(Mounted(moved, carrier, at, other.joints[index], other.inertias[index]))
     new = with_mounted(model, bodies, parts)
     on = new.getJointId(model.names[joint])
-    others = {ROOT: on} | {
-        index: new.getJointId(names[index]) for index in range(ROOT + 1, other.njoints)
-    }
+    others = {ROOT: on} | {i: new.getJointId(names[i]) for i in range(ROOT + 1, other.njoints)}
     carry_over(other, new, {index: at for index, at in others.items() if index > ROOT})
     new.addFrame(pin.Frame(prefix, on, placement, pin.FrameType.BODY), False)
     for frame in other.frames.tolist()[1:]:

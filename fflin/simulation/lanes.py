@@ -94,22 +94,20 @@ class LaneLoop:
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
-        if runs and "delay" in runs:  # provide space for the largest delay
+        runs = runs or {}
+        if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
-        parts, stop = packed(plan), stop_conditions(plan)
-        law = parts.law
-        if runs and "seed" in runs and len(law.added) == len(law.y):
-            law = law._replace(added=np.zeros(SLOTS * len(law.y)))
+        stop = stop_conditions(plan)
         if runs:  # all runs are given with a quaternion for which the sign is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
-        parts = parts._replace(law=law, stop=parts.stop._replace(sign=stop.sign))
+        parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
-        self._ending, self._noisy = ending_of(plan, stop), len(law.added) > len(law.y)
+        self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
         # Laned arrays, each with the column of its initial values.
         self._fresh: list[tuple[Array, Array]] = []
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self.parts, loop.ARGUMENTS)
-        self._work = work_space(self.parts.robot.layout.size)
+        self._work = work_space(self.parts.robot.tree.size)
         self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
         ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
@@ -117,8 +115,7 @@ class LaneLoop:
         self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
         self._of_run = {
             **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
-            **{key: getattr(robot.tree, key) for key in ("bodies", "fixed")},
-            **{key: getattr(robot.loads, key) for key in robot.loads._fields},
+            **robot.tree._asdict(),
             **robot.faults._asdict(),
         }
 
@@ -315,11 +312,6 @@ def carried_out(plan: Plan, engine: str) -> Recording:
     spent = time.perf_counter() - began
     if spent > LONG_RUN and slower:
         once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-        _log.warning(
-            "fflin: the simulation took %.0f s in Python; engine='compiled' (--engine compiled) "
-            "would take about %.0f s%s",
-            spent,
-            _FRACTION * spent,
-            once,
-        )
+        said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled) would"
+        _log.warning(f"fflin: {said} take about %.0f s%s", spent, _FRACTION * spent, once)
     return run

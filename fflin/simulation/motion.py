@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,19 +15,25 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending
-from fflin.dynamics.coordinates import attitude_errors, moving_errors
+from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
+from fflin.dynamics.impact import Impact, joint_called
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
+from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
-from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
-
-FORMATS = (*record.FORMATS, ".csv")
+from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fflin.dynamics.impact import Impact
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
+
+FORMATS = (*record.FORMATS, ".csv")
+
+# Largest difference of rates and displacements between the end of a phase and the next phase's
+# start.
+_MET = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,9 +263,18 @@ class Motion(Design):
             If a phase does not begin at the end of the phase before it, has another frame or more
             inputs than this motion, or was read from a file.
         """
-        from fflin.simulation.phases import carried_on
-
-        return carried_on(self, later)
+        if not later or isinstance(later[-1], Impact):
+            raise InputError(
+                "the last phase is an impact, expected a Motion; simulate the robot after the "
+                "impact"
+            )
+        parts = (*(self._phases or (self,)), *later)
+        if not all(getattr(part, "_robot", part) for part in parts):
+            raise InputError(
+                "a motion that was read from a file lacks its robot; join motions returned by "
+                "simulate"
+            )
+        return _joined(parts[0], parts)
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory, which can be linearised or tracked.
@@ -276,13 +291,12 @@ class Motion(Design):
     @property
     def passed(self) -> tuple[Passed, ...]:
         """Limit violations with value, time and limit, sorted by relative size, largest first."""
-        return passed(self.t, limited(self))
+        return passed(self.t, curves(self))
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
         """Inputs and wheel speeds that saturated, sorted by time in saturation, longest first."""
-        names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
-        return saturated(self.t, (each for each in limited(self) if each[0] in names))
+        return saturated(self.t, curves(self))
 
     def save(self, path: str | Path) -> None:
         """Save the motion to a .npz, .mat, .json or .csv file, atomically.
@@ -359,3 +373,89 @@ def plot_motion(
     from fflin.simulation.plots import draw_motion
 
     return draw_motion(require_motion(motion), path, show)
+
+
+def _joined(first: Motion, parts: tuple[Motion | Impact, ...]) -> Motion:
+    """Join the parts of a motion, motions and impacts; `first` is the first part."""
+    whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
+    robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
+    for part in parts[1:]:
+        if isinstance(part, Impact):
+            name, (other, other_q, other_v) = part.event, part._before
+        else:
+            instance("a phase", part, Motion, "a Motion, or an Impact before one")
+            name, other, other_q, other_v = event or part.robot, part._robot, part.q[0], part.v[0]
+        seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
+        apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
+        if apart.max() > _MET * max(1.0, np.abs(v).max()):
+            at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
+            raise InputError(
+                f"'{name}' does not begin where the motion before it ended: "
+                f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
+                "start from q and v in the last row of that motion"
+            )
+        if isinstance(part, Impact):
+            robot, q, v, event = part.robot, part.q, part.v, part.event
+            whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
+        else:
+            robot, q, v, event = other, part.q[-1], part.v[-1], ""
+            whole = _longer(whole, part, name)
+    return whole
+
+
+def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
+    """Convert rows of another robot to this robot's coordinates; missing joints are at rest."""
+    own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
+    for name in list(robot.model.names)[ROOT:]:
+        if other.model.existJointName(name):
+            here, there = joint_called(robot, name), joint_called(other, name)
+            own_q[:, here.idx_q :][:, : here.nq] = q[:, there.idx_q :][:, : here.nq]
+            own_v[:, here.idx_v :][:, : here.nv] = v[:, there.idx_v :][:, : here.nv]
+    return own_q, own_v
+
+
+def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
+    """Append the rows of another motion, converted to this motion's chart, joints and inputs."""
+    if (motion.frame, motion.circles) != (whole.frame, whole.circles):
+        where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
+        raise InputError(
+            f"'{name}' is in the frame {where}, the first phase in {before}; simulate both in one "
+            "frame"
+        )
+    if more := [name for name in motion.input_names if name not in whole.input_names]:
+        raise InputError(
+            f"a phase has the input {more[0]}, which the first phase lacks; give the first robot "
+            "that input"
+        )
+    frame = frame_of(whole._robot, whole.frame)
+    state, there = (StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion))
+    last, near, t = whole.q[-1], whole.x[-1], motion.t - motion.t[0] + whole.t[-1]
+    q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
+    target = np.zeros(0)
+    if whole.target.size and motion.target.size:
+        points = there.points(np.atleast_2d(motion.target))[1:]
+        goals = state_history(state, *_seen(state.robot, there.robot, last, *points), near)
+        both = (whole.target, len(whole.t)), (goals, len(t))
+        target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in both])
+    u = np.zeros((len(t), len(whole.input_names)))  # missing inputs are zero
+    u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
+    for held in Actuation(state).held:  # in reference axes
+        u[:, held] = u[:, held] @ there.reference.rotation.T @ state.reference.rotation
+    rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
+    for key in ("energy", "momentum", "momentum_drift", "com_drift"):
+        rows[key] = getattr(motion, key)
+    joined: dict[str, Any] = {
+        key: np.concatenate((getattr(whole, key), added)) for key, added in rows.items()
+    }
+    return replace(
+        whole,
+        **joined,
+        target=target,
+        prediction=whole.prediction[:0],
+        steered=tuple(x for x in whole.steered if x in motion.steered),
+        stopped=motion.stopped,
+        notes=tuple(dict.fromkeys((*whole.notes, *motion.notes))),
+        verified=whole.verified and motion.verified,
+        phases=(*whole.phases, name),
+        starts=np.append(whole.starts, whole.t[-1]),
+    )

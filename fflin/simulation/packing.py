@@ -17,20 +17,22 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOut
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
-from fflin.kernel.tree import batch_tree, layout_of, loads_of
+from fflin.kernel.tree import batch_tree
 from fflin.robot.fields import limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import Plant
-from fflin.simulation.run import Conserved, stop_conditions
+from fflin.simulation.run import Plant
 
 SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
 
 
-def packed(plan: Plan) -> loop.Arguments:
-    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports."""
+def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
+    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
+
+    `stop` has rates in the order of v. The law has room for noise if it is `noisy`.
+    """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
-    h, state, kept, stop = times.dt, plant.state, Conserved(plan), stop_conditions(plan)
+    h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     mechanics = mechanics_of(plant)
     # Commands that would act only after the end of the run need no space in the delay line.
@@ -46,14 +48,10 @@ def packed(plan: Plan) -> loop.Arguments:
             weights=np.array(method.weights) * h,
             moments=h * (np.array(method.moments) * h),
         ),
-        law=_law(plan, mechanics),
+        law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
-        reference=forward.MomentumReference(
-            start=np.concatenate((kept.momentum, kept.center(0.0), plan.q[:3])),
-            weight=kept.mass * np.array(state.robot.gravity),
-            per_mass=[1.0 / kept.mass],
-            sums=np.zeros(forward.SUMS),
-        ),
+        # The loop writes these at its start.
+        reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
         stop=stop._replace(squares=state.velocities(stop.squares)),
@@ -73,19 +71,16 @@ def packed(plan: Plan) -> loop.Arguments:
 def mechanics_of(plant: Plant) -> forward.Mechanics:
     """Return the kernel's parameters of a robot."""
     robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
+    springs = robot.springs
     assert tree is not None
-    fixed, springs, loads = actuation.fixed, robot.springs, loads_of(robot, actuation, tree)
     return forward.Mechanics(
         tree=tree,
-        layout=layout_of(tree, len(loads.input)),
-        loads=loads,
         gravity=list(robot.gravity),
         index=[joint.idx_q for joint in robot.joints],
         circling=[joint.unbounded for joint in robot.joints],
         scale=[joint.scale for joint in robot.joints],
         springy=(springs.stiffness != 0.0) | (springs.damping != 0.0),
         rest=springs.rest,
-        row=np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1),
         held=[held.start for held in actuation.held],
         triads=plant.triads,
         origin=pin.SE3ToXYZQUAT(plant.state.origin),
@@ -115,7 +110,7 @@ def noise_of(plan: Plan) -> Callable[[float], ArrayLike] | None:
     return noise
 
 
-def _law(plan: Plan, mechanics: forward.Mechanics) -> policies.Law:
+def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy; with an allocation, of the robot `asking`."""
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
@@ -137,7 +132,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics) -> policies.Law:
         else:
             law = law._replace(grid=_grid(policy, state.robot.joint_names))
         law = law._replace(near=x0[state.groups.q_m].copy())
-    size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
+    size, slots = len(law.measured), SLOTS if noisy or noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
@@ -203,7 +198,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
         asking=asks,
         giving=giving,
         point=point,
-        work=np.zeros(max(asks.layout.size, giving.layout.size)),
+        work=np.zeros(max(asks.tree.size, giving.tree.size)),
         problem=allocation.least_squares(least, most, size),
     )
 

@@ -29,7 +29,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
-from fflin.simulation.plant import Disturbance, Plant
+from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -40,7 +40,6 @@ Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
 # Bounds of an automatic duration [s], and the time step [s] of the linear loop that determines it.
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
-LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _STEP = 0.01  # [s]
 # If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
 _BEFORE = 1e-6
@@ -144,10 +143,11 @@ class Plan:
         _require_room(times, state, chosen=options.dt is None)
         expected = "a list of functions event(t, q, v)"
         self.events = tuple(instance("events", options.events, Sequence, expected))
-        for each in self.events if options.callback is None else (*self.events, options.callback):
-            if not callable(each):
+        for each in (*self.events, options.callback, options.disturbance):
+            if not (each is None or callable(each)):
                 raise InputError(
-                    f"{each!r} is not a function; events take (t, q, v), callbacks (t, q, v, u)"
+                    f"{each!r} is not a function; events and disturbances take (t, q, v), "
+                    "callbacks (t, q, v, u)"
                 )
         # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
         acting, self.known = chosen_limits(robot, options.limits)
@@ -210,14 +210,13 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
     theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
-    if target.moving or not theirs:
+    # q differs between orbital frames.
+    if target.moving or not theirs or (state.robot.orbit and target.frame != state.frame):
         raise InputError(
-            f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' "
-            "or a model of that robot about a fixed point"
+            f"target is a model of '{target.robot}' in frame '{target.frame}', expected a state of "
+            f"'{state.robot.name}' or a model of that robot about a fixed point"
+            f"{f' in frame {state.frame!r}' * bool(state.robot.orbit)}"
         )
-    if state.robot.orbit and target.frame != state.frame:
-        said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
-        raise InputError(f"{said}, the frame of the motion; q differs between orbital frames")
     goal = state.read(target.q, target.v)
     # If the model has another reference or frame, its base states cannot be copied.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from textwrap import shorten
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,15 +32,13 @@ _SHARE = 1e-3
 
 _MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
 
-# Signal with limits: its name, history (N,), unit, and least and largest value (2,).
-Limited: TypeAlias = "tuple[str, Array, str, Array]"
-
 _OF_PHASES = (
     "|p|: linear momentum; |h|: angular momentum about the centre of mass;\n"
     "before: total of all bodies in the impact"
 )
 
-_TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
+_STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+_TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
 # Errors of flexible appendages and liquids, which do not count as settling.
 _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
@@ -50,6 +48,60 @@ _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 # Rotation [deg] up to which a modal amplitude is accurate, because the model is linear in the
 # amplitude.
 _LINEAR = 5.0
+
+# A limit is drawn if the curve reaches this fraction of the limit.
+_NEAR = 1.0 / 3.0
+
+
+class Curve(NamedTuple):
+    """Values (N,) of a state or input, limits (2,), and any prediction and reference (N,)."""
+
+    key: str  # GROUP.NAME
+    group: str  # "speed" and "momentum" of wheels
+    name: str
+    unit: str
+    values: Array
+    limits: Array
+    linear: Array | None = None
+    reference: Array | None = None
+
+    @property
+    def short(self) -> str:
+        """Name without its group."""
+        return self.name.partition(".")[2] or self.name
+
+    @property
+    def levels(self) -> list[float]:
+        """Finite limits."""
+        levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
+        return levels
+
+    @property
+    def near(self) -> list[float]:
+        """Limits that the values come close to."""
+        return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
+
+
+def curves(motion: Motion) -> Iterator[Curve]:
+    """Yield curves of states, inputs, and speed and momentum of wheels."""
+    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
+    inertias = dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
+    unlimited = np.full(2, np.inf)
+    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
+        group, _, entry = name.partition(".")
+        wheel = group in _OF_MODES and entry in motion.wheels
+        kinds = [("speed", unit, 1.0), ("momentum", "N m s", inertias.get(entry, 0.0))]
+        for kind, of_kind, size in kinds if wheel else [(group, unit, 1.0)]:
+            if size and not (wheel and group == "q_m"):
+                bounds, values = size * limits.get(name, unlimited), size * motion.x[:, i]
+                linear = None if motion.linear is None else size * motion.linear[:, i]
+                target = size * motion.target[:, i] if motion.tracked else None
+                yield Curve(name, kind, name, of_kind, values, bounds, linear, target)
+    inputs = zip(
+        input_keys(motion), motion.input_names, motion.input_units, motion.u.T, strict=True
+    )
+    for key, name, unit, column in inputs:
+        yield Curve(key, key.partition(".")[0], name, unit, column, limits.get(name, unlimited))
 
 
 class Passed(NamedTuple):
@@ -81,49 +133,41 @@ class Saturated(NamedTuple):
         return f"{_name(self.name)} at its limit of {size} for {_percent(self.share)} % of the run"
 
 
-def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
+def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
     """Return the limit violations, with the largest relative violation first."""
-    found = []
-    for name, values, unit, limits in histories:
-        size = float(np.abs(limits[np.isfinite(limits)]).max())
-        excess = np.maximum(limits[0] - values, values - limits[1])
-        at = int(excess.argmax())
-        if excess[at] > max(_SHARE * size, 1e-12):
-            limit = float(limits[int(values[at] > limits[1])])
-            first = name.startswith("q_m.") and bool(excess[0] > max(_SHARE * size, 1e-12))
-            one = Passed(name, float(values[at]), float(t[at]), limit, unit, first)
-            found.append((-excess[at] / (size or 1e-12), one))
-    return tuple(one for _, one in sorted(found))
+    worst = []
+    for curve in found:
+        if curve.group == "momentum" or not curve.levels:
+            continue
+        size, (low, high) = max(map(abs, curve.levels)), curve.limits
+        excess = np.maximum(low - curve.values, curve.values - high)
+        beyond, at = excess > max(_SHARE * size, 1e-12), int(excess.argmax())
+        if beyond[at]:
+            value, first = float(curve.values[at]), curve.group == "q_m" and bool(beyond[0])
+            limit = float(high if value > high else low)
+            one = Passed(curve.name, value, float(t[at]), limit, curve.unit, first)
+            worst.append((-excess[at] / (size or 1e-12), one))
+    return tuple(one for _, one in sorted(worst))
 
 
-def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
-    """Return signals at a nonzero limit, with the longest saturation first."""
-    held = np.diff(t, append=t[-1:])
-    found = [
-        Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
-        for name, values, unit, limits in histories
-        for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
+def saturated(t: Array, found: Iterable[Curve]) -> tuple[Saturated, ...]:
+    """Return inputs and wheel speeds at a nonzero limit, with the longest saturation first."""
+    held, full = np.diff(t, append=t[-1:]), list[Saturated]()
+    for curve in found:
         # A wheel speed only approaches its limit, but an input is clipped exactly at its limit.
-        if held[
-            near := np.abs(values - limit) <= (1e-3 if "qdot_m." in name else 1e-9) * abs(limit)
-        ].any()
-    ]
-    return tuple(sorted(found, key=lambda each: -each.share))
-
-
-def limited(motion: Motion) -> Iterator[Limited]:
-    """Yield the states and inputs of a motion that have limits."""
-    names = motion.state_names + motion.input_names
-    units = motion.state_units + motion.input_units
-    columns = np.hstack((motion.x, motion.u)).T
-    for name, limits in zip(motion.limit_names, motion.limits, strict=True):
-        at = names.index(name)
-        yield name, columns[at], units[at], limits
+        margin = 1e-3 if curve.group == "speed" else 1e-9
+        enforced = curve.group not in (*_STATES, "momentum")
+        for limit in curve.levels if enforced else ():
+            spent = held[np.abs(curve.values - limit) <= margin * abs(limit)]
+            if limit and spent.any():
+                share = float(spent.sum() / held.sum())
+                full.append(Saturated(curve.name, limit, curve.unit, share))
+    return tuple(sorted(full, key=lambda each: -each.share))
 
 
 def _name(name: str) -> str:
     group, _, entry = name.partition(".")
-    return entry if group in ("q_m", "qdot_m") else name
+    return entry if group in _OF_MODES else name
 
 
 def _percent(share: float) -> str:
@@ -150,22 +194,14 @@ def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
 
 
 class ErrorHistory(NamedTuple):
-    """History (N,) of the size of one kind of error, and whether the policy feeds it back."""
+    """History (N,) of the size of one kind of error."""
 
     title: str
     unit: str
     size: Array
-    steered: bool
-
-    @property
-    def settled(self) -> int:
-        """First row from which the error is settled; N if the error has not settled."""
-        return int(settled_at(self.size))
-
-    @property
-    def late(self) -> bool:
-        """Whether the error settles too late or not at all."""
-        return bool(is_late(self.settled, len(self.size)))
+    steered: bool  # whether the policy feeds the error back
+    settled: int  # first row from which the error is settled; N if it has not settled
+    late: bool  # whether the error settles too late or not at all
 
     @property
     def last(self) -> str:
@@ -174,34 +210,68 @@ class ErrorHistory(NamedTuple):
 
     def row(self, t: Array) -> list[str]:
         """Return the row of this error in the table."""
-        values = (self.size[0], self.size.max(), self.size[-1])
-        cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
+        cells = _cells(self.size[0], self.size.max(), self.size[-1])
         not_yet = "not yet" if self.steered else "not controlled"
         when = not_yet if self.late else f"{t[self.settled]:.3g}"
-        if self.size.max() <= THERE:
-            when = "."
-        return [self.title, self.unit, *cells, when]
+        return [self.title, self.unit, *cells, "." if self.size.max() <= THERE else when]
+
+
+def _cells(*values: float) -> list[str]:
+    return ["." if value < _NOTHING else f"{value:.3g}" for value in values]
+
+
+def error_histories(motion: Motion) -> list[ErrorHistory]:
+    """Return the errors of each kind, or an empty list without a target.
+
+    Wheel speeds and modes have their own kinds. Wheel angles are left out.
+    """
+    if motion.error is None or motion.attitude_error is None:
+        return []
+    steered, sizes, found = set(motion.steered or motion.state_names), np.abs(motion.error), []
+    kinds: dict[tuple[str, str], list[int]] = {}
+    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
+        group, _, entry = name.partition(".")
+        title = _TITLES.get(group, group)
+        if group == "q_m" and entry in motion.wheels:
+            continue
+        if group == "qdot_m" and entry in motion.wheels:
+            title = "wheel speeds"
+        if group in _OF_MODES and entry in motion.modes:
+            title = _OF_MODES[group][not unit.startswith(_MODAL)]
+        kinds.setdefault((title, "deg" if group == "q_b" else unit), []).append(i)
+    for (title, unit), of in kinds.items():
+        size = motion.attitude_error if title == "attitude" else sizes[:, of].max(axis=1)
+        fed_back = any(motion.state_names[i] in steered for i in of)
+        fed_back &= title not in ("position", "v_b") or pushed(motion)
+        settled = int(settled_at(size))
+        late = bool(is_late(settled, len(size)))
+        found.append(ErrorHistory(title, unit, size, fed_back, settled, late))
+    return found
+
+
+def pushed(of: object) -> bool:
+    """Return whether an input of a motion or similar object is a force on the base."""
+    return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
 def motion_report(motion: Motion) -> str:
     """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
-    kinds = error_histories(motion)
+    kinds, t = error_histories(motion), motion.t
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
-    run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
-    circling = [str(motion.orbit)] if motion.orbit else []
-    parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
-    if not (kinds or motion.target.size):
-        rows = [["change from the start", "unit", "largest", "final"]]
-        gone = [each.row(motion.t) for each in error_histories(replace(motion, target=motion.x[0]))]
-        rows += [
-            [*each[:2], *each[3:5]] for each in gone if each[0] in (*_PLACES, *_OF_MODES["q_m"])
-        ]
-        parts.append(f"\n{grid(rows, 'll')}\n")
+    head.append(f"{motion.robot}: {t[-1]:g} s, {len(t)} rows, frame {motion.frame}{by}")
+    parts = [folded([*head, *([str(motion.orbit)] if motion.orbit else []), *motion.notes])]
     if kinds:
-        settled = f"settles to {100.0 * SETTLED:g} % at [s]"
-        rows = [["error", "unit", "initial", "largest", "final", settled]]
-        parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
+        rows = [["error", "unit", "initial", "largest", "final"]]
+        rows[0].append(f"settles to {100.0 * SETTLED:g} % at [s]")
+        rows += [kind.row(t) for kind in kinds]
+        parts.append(f"\n{grid(rows, 'll')}\n")
+    elif not motion.target.size:
+        rows = [["change from the start", "unit", "largest", "final"]]
+        for kind in error_histories(replace(motion, target=motion.x[0])):
+            if kind.title in (*_PLACES, *_OF_MODES["q_m"]):
+                rows.append([kind.title, kind.unit, *_cells(kind.size.max(), kind.size[-1])])
+        parts.append(f"\n{grid(rows, 'll')}\n")
     if motion.modes:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
@@ -212,10 +282,9 @@ def motion_report(motion: Motion) -> str:
         parts.append(folded(said[:_MOST] + more))
     if motion.phases:
         parts += [f"\n{grid(_phases(motion), 'll')}", _OF_PHASES, ""]
-    first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
-    drift = f"{motion.momentum_drift.max():.1e}"
-    kept = f"{motion.kept} drift {drift}".replace(" ", "\u00a0")
-    parts.append(folded([f"energy: initial {first}, final {last}; {kept}"]))
+    first, last = motion.energy[[0, -1]]
+    kept = f"{motion.kept} drift {motion.momentum_drift.max():.1e}".replace(" ", "\u00a0")
+    parts.append(folded([f"energy: initial {first:.6g} J, final {last:.6g} J; {kept}"]))
     if len(motion.com_drift):
         far = f"{motion.com_drift.max():.1e} m"
         parts.append(f"largest deviation of the centre of mass from its predicted path: {far}")
@@ -225,14 +294,16 @@ def motion_report(motion: Motion) -> str:
         apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
         most = int(apart.argmax())
         size = f"{apart[most]:.3g} {motion.state_units[most]}".removesuffix(" 1")
-        where = f"{size} in {motion.state_names[most]}"
-        parts.append(f"largest difference from the linear model: {where}")
+        parts.append(
+            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
+        )
     return "\n".join(parts)
 
 
 def motion_record(motion: Motion) -> dict[str, object]:
     """Return the numbers of the report by name."""
-    t = motion.t
+    t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
+    own += ["state_names", "state_units", "input_names", "input_units"]
     errors = {
         each.title: {
             "unit": each.unit,
@@ -244,82 +315,38 @@ def motion_record(motion: Motion) -> dict[str, object]:
         for each in error_histories(motion)
     }
     return {
-        "stopped": motion.stopped,
+        **{name: getattr(motion, name) for name in own},
         "duration": t[-1],
         "rows": len(t),
-        "frame": motion.frame,
-        "engine": motion.engine,
         "errors": errors,
-        "state_names": motion.state_names,
-        "state_units": motion.state_units,
         "x": motion.x[-1],
-        "input_names": motion.input_names,
-        "input_units": motion.input_units,
         "largest_inputs": np.abs(motion.u).max(axis=0),
         "limits_exceeded": motion.passed,
-        "saturated": motion.saturated,
         "energy": motion.energy[[0, -1]],
         "momentum_drift": motion.momentum_drift.max(),
-        "notes": motion.notes,
     }
 
 
 def _phases(motion: Motion) -> list[list[str]]:
     """Return the table of phases; for a motion from a file, the table lacks the impacts."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
-
-    def row(name: str, when: str, time: float, energy: float, momentum: Array) -> None:
-        sizes = (np.linalg.norm(each) for each in (momentum[3:], momentum[:3]))
-        table.append([name, when, *(f"{x:.4g}" for x in (time, energy, *sizes))])
-
     parts = motion._phases or motion.phases
     pairs = zip((None, *parts), parts, strict=False)
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        start, end = firsts[k], firsts[k + 1] - 1
-        shown, energy, momentum = shorten(name, 28), motion.energy[start], motion.momentum[start]
-        met = isinstance(impact, Impact)
-        if met:
-            change = np.roll(impact.momentum_after - impact.momentum, 3)
-            row(shown, "before", motion.t[start], energy + impact.energy_lost, momentum - change)
-            shown = ""
-        row(shown, "after" if met else "start", motion.t[start], energy, momentum)
-        row("", "end", motion.t[end], motion.energy[end], motion.momentum[end])
+        # Each line with its row, and the energy and momentum that are not of this row.
+        lines = [("start", firsts[k], 0.0, np.zeros(6))]
+        if isinstance(impact, Impact):
+            gone = np.roll(impact.momentum - impact.momentum_after, 3)
+            lines = [("before", firsts[k], impact.energy_lost, gone), ("after", *lines[0][1:])]
+        lines.append(("end", firsts[k + 1] - 1, 0.0, np.zeros(6)))
+        for when, at, energy, momentum in lines:
+            h, p = (motion.momentum[at] + momentum).reshape(2, 3)
+            sizes = motion.t[at], motion.energy[at] + energy, np.linalg.norm(p), np.linalg.norm(h)
+            shown = shorten(name, 28) if when == lines[0][0] else ""
+            table.append([shown, when, *(f"{x:.4g}" for x in sizes)])
     return table
-
-
-def error_histories(motion: Motion) -> list[ErrorHistory]:
-    """Return the errors of each kind, or an empty list without a target.
-
-    Wheel speeds and modes have their own kinds. Wheel angles are left out.
-    """
-    if motion.error is None or motion.attitude_error is None:
-        return []
-    steered = set(motion.steered or motion.state_names)
-    sizes = np.abs(motion.error)
-    columns: dict[tuple[str, str], list[int]] = {}
-    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
-        group, _, entry = name.partition(".")
-        title = _TITLES.get(group, group)
-        if group == "qdot_m" and entry in motion.wheels:
-            title = "wheel speeds"
-        if group in _OF_MODES and entry in motion.modes:
-            title = _OF_MODES[group][not unit.startswith(_MODAL)]
-        if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
-            columns.setdefault((title, unit), []).append(i)
-    attitude = any(name.startswith("q_b.") for name in steered)
-    found = [ErrorHistory("attitude", "deg", motion.attitude_error, attitude)]
-    for of, at in columns.items():
-        fed_back = any(motion.state_names[i] in steered for i in at)
-        fed_back &= of[0] not in ("position", "v_b") or pushed(motion)
-        found.append(ErrorHistory(*of, sizes[:, at].max(axis=1), fed_back))
-    return found
-
-
-def pushed(of: object) -> bool:
-    """Return whether an input of a motion or similar object is a force on the base."""
-    return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
 def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
@@ -347,17 +374,12 @@ def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
         said = f"settled: {which}at the target throughout the run"
     if aside:
         said += f"; not controlled: {_and(aside)}"
-    return f"{said}; saturated inputs: {_full(motion)}"
-
-
-def _full(motion: Motion) -> str:
-    """Return the inputs and wheels at a limit, each with the fraction of the run spent there."""
-    shares: dict[str, float] = {}  # sum for both limits
+    shares: dict[str, float] = {}  # of the run at a limit, summed over both limits
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
-    said = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
-    more = [f"{len(said) - _NAMED} more"] if len(said) > _NAMED else []
-    return ", ".join(said[:_NAMED] + more) or "none"
+    full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
+    more = [f"{len(full) - _NAMED} more"] if len(full) > _NAMED else []
+    return f"{said}; saturated inputs: {', '.join(full[:_NAMED] + more) or 'none'}"
 
 
 def _and(words: list[str]) -> str:
@@ -371,10 +393,8 @@ def _largest_modes(motion: Motion) -> str:
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):
         at = motion.state_names.index(f"q_m.{name}")
         size, unit = np.abs(motion.x[:, at]), motion.state_units[at]
-        largest = float(size.max())
-        degrees = float(np.degrees(rotation * largest))
-        cells = ["." if value < _NOTHING else f"{value:.3g}" for value in (largest, degrees)]
-        rows.append([name, unit, *cells, f"{motion.t[size.argmax()]:.3g}"])
+        degrees = float(np.degrees(rotation * size.max()))
+        rows.append([name, unit, *_cells(size.max(), degrees), f"{motion.t[size.argmax()]:.3g}"])
         if degrees > _LINEAR and unit == _MODAL:
             far.append(f"{name}\u00a0{degrees:.3g}\u00a0deg")
     table = f"{grid(rows, 'll')}\n"

@@ -1,42 +1,137 @@
-"""The simulation loop in Python: steps of a plan, their records, and the conserved quantities.
+"""The engine in Python: accelerations, conserved quantities, and the loop over a plan.
 
 Without external forces the momentum about a fixed point is constant, and the centre of mass moves
 along r_c(t) = r_c(0) + p t / m. In orbit the Jacobi integral (14.3) is conserved instead.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dposv
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, as_double
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.points import LARGEST_SPEED
+from fflin.dynamics.state import StateMap
+from fflin.kernel.forward import ActuatorFaults, apply_faults
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
-from fflin.simulation.plan import LARGEST_TURN, Plan
+from fflin.robot.mass_properties import require_inertia
+
+if TYPE_CHECKING:
+    from fflin.simulation.plan import Plan
+
+# Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force and
+# torque on the base in base axes, then joint forces.
+Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+# Velocity above which a disturbance need not be finite, because the motion has diverged.
+_DIVERGED = 1e6
+_LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
+LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _LOOK = 16  # steps between checks of the clock
 _LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the number
 
-_crba, _placement = pin.crba, pin.XYZQUATToSE3
+_aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
 
-class Histories(NamedTuple):
-    """Histories of energy, of momentum about the centre of mass, and of the centre of mass."""
+class Plant:
+    """The nonlinear robot under inputs (in the axes of the state's frame) and a disturbance."""
 
-    energy: Array  # (N,)
-    momentum: Array  # (N, 6)
-    center: Array  # (N, 3)
-    kept: Array  # (N, 6) momentum about the point; in orbit, the Jacobi integral and zeros
-    scale: Array  # (2,) bounds (11.5) of the linear and the angular part of `kept`
+    def __init__(
+        self,
+        state: StateMap,
+        disturbance: Disturbance | None = None,
+        faults: ActuatorFaults | None = None,
+    ) -> None:
+        robot = state.robot
+        require_inertia(robot)
+        self.state, self.robot = state, robot
+        self._aba = Aba(state)
+        self.actuation = self._aba.actuation
+        self.disturbance = disturbance
+        self._model, self._data = robot.model, robot.create_data()
+        nu, groups = len(self.actuation.names), self.actuation.groups
+        # Index of the first of the three inputs of each vector on the base.
+        self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
+        self.faults = faults or ActuatorFaults(
+            gain=np.ones(nu),
+            bias=np.zeros(nu),
+            until=np.full(nu, np.inf),
+            turn=np.tile(np.eye(3).ravel(), len(self.triads)),
+        )
+        self._faulty = faults is not None
+        self._columns = np.column_stack(
+            [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
+        )
+        # Whether only u acts on the robot, with a constant input matrix.
+        self._plain = (
+            state.S is None
+            and not self.actuation.carried
+            and not robot.stored_momentum
+            and not any(values.any() for values in robot.springs)
+            and not any(robot.gravity)
+            and not robot.orbit
+        )
+        self.field = self._aba.field
+
+    def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
+
+        In orbit, the wrench is replaced by the power [W] of inputs, disturbance and dampers,
+        followed by zeros.
+        """
+        if self._faulty:
+            given = np.empty(len(u))
+            apply_faults(self.faults, self.triads, t, u, given)
+            u = given
+        if self.actuation.held:  # rotated by R instead of the chart, which is singular at 180 deg
+            R, u = self.state.rotation(q), u.copy()
+            for held in self.actuation.held:
+                u[held] = u[held].dot(R)
+        if self._plain and self.disturbance is None:
+            tau = self._columns.dot(u)
+            return _aba(self._model, self._data, q, v, tau), tau[:6]
+        force = self.actuation.columns(self._data, q) @ u
+        disturbed = None
+        if self.disturbance is not None:
+            disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
+        rate = self._aba.acceleration(q, v, u, disturbed)
+        push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
+        if self.field:
+            nu = self.state.velocities(v)
+            power = nu.dot(force) - self.robot.springs.damping.dot(nu[6:] ** 2)
+            push = np.append(power if disturbed is None else power + v.dot(disturbed), np.zeros(5))
+        return rate, push
+
+    def isolated(self, *, driven: bool) -> bool:
+        """Return whether no external force acts; if `driven`, wrenches of inputs count too."""
+        driven = driven or bool(self.faults.bias.any())
+        base = driven and (self._columns[:6].any() or self.actuation.carried)
+        outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
+        return not (base or outside)
+
+    def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
+        force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
+        finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
+        if force.shape != (self.robot.nv,) or not finite:
+            raise InputError(
+                f"disturbance(t, q, v) returned shape {force.shape} at t = {t:g} s, expected "
+                f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
+            )
+        return force
 
 
 class Conserved:
@@ -65,9 +160,9 @@ class Conserved:
         self._root = robot.model.jointPlacements[ROOT]
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
-        history, per_mass = self.histories(plan.q[None], plan.v[None]), 1.0 / robot.mass
-        self.momentum = self._momentum = history.kept[0]
-        self._center = history.center[0]
+        _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
+        self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
+        per_mass = 1.0 / robot.mass
         # Position and velocity of the centre of mass without external forces, as columns.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
@@ -129,8 +224,13 @@ class Conserved:
         v_b = v[:6]
         v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
-    def histories(self, q: Array, v: Array) -> Histories:
-        """Return the conserved quantities at each row of q (N, nq) and v (N, nv)."""
+    def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the conserved quantities at each row of q (N, nq) and v (N, nv).
+
+        They are energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
+        momentum about the point (N, 6), and bounds (2,) of its linear and its angular part (11.5).
+        In orbit, the Jacobi integral and zeros take the place of the momentum about the point.
+        """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
         near[:, :7] -= self._start
@@ -163,7 +263,7 @@ class Conserved:
             scale = np.array([(np.abs(energy) + np.abs(potential)).max(), 0.0])
             energy += potential
             kept = np.column_stack((energy, np.zeros((rows, 5))))
-        return Histories(energy, momentum, center, kept, scale)
+        return energy, momentum, center, kept, scale
 
     def _of_wheels(self) -> Array:
         """Return the stored momentum (3,) at the last evaluated link poses, in world axes."""
@@ -218,7 +318,11 @@ def go(plan: Plan, hint: str = "") -> Recording:
             follow(weights[stages - 1, : stages + 1], stages == len(weights))
         return a
 
-    stopped, ending, bar = "", ending_of(plan), Progress(plan.options.progress)
+    stopped, ending, bar = (
+        "",
+        ending_of(plan, stop_conditions(plan)),
+        Progress(plan.options.progress),
+    )
     try:
         for step in range(times.steps):
             u = channel.begin(step, t, q, v) if channel else plan.initial
@@ -256,11 +360,8 @@ def stop_conditions(plan: Plan) -> StopConditions:
     return StopConditions(squares=squares, sign=[sign])
 
 
-def ending_of(
-    plan: Plan, stop: StopConditions | None = None
-) -> Callable[[float, Array, Array], str]:
+def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
     """Build a function that returns why a run ends, or an empty text if the run continues."""
-    stop = stop or stop_conditions(plan)
     # The entries of a list are read faster than the entries of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])

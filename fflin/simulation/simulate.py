@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Compensation, Policy, StateFeedback
+from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
 from fflin.linear.model import LinearModel
@@ -19,8 +19,7 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import carried_out, engine_of
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
-from fflin.simulation.plant import Disturbance
-from fflin.simulation.run import Conserved, Recording
+from fflin.simulation.run import Conserved, Disturbance, Recording
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -213,19 +212,19 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     if plan.reference is not None:
         q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
         target = state_history(state, q, v, plan.near, run.t)
-    history = Conserved(plan).histories(run.q, run.v)
-    missing = np.linalg.norm((history.kept - run.momentum).reshape(-1, 2, 3), axis=2)
-    drift = np.divide(missing, history.scale, np.zeros_like(missing), where=history.scale > 0.0)
+    energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
+    missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
+    drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
     return Motion(
         **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
         target=target,
         prediction=x[:0] if foresees is None else predict(plan, foresees, x, run.steps),
-        energy=history.energy,
-        momentum=np.roll(history.momentum, 3, axis=1),
+        energy=energy,
+        momentum=np.roll(momentum, 3, axis=1),
         momentum_drift=drift.max(axis=1),
         # In orbit, the centre of mass does not move along a straight line even without forces.
-        com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
+        com_drift=np.linalg.norm(center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
@@ -249,31 +248,41 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
 
 def predictor(plan: Plan) -> Predictor | None:
     """Return the predictor of a plan's motion: of the policy's own model, or the given model."""
-    linear, policy, plant = plan.options.linear, plan.policy, plan.plant
-    given = not (linear is None or isinstance(linear, bool | np.bool_))
-    if not (given or linear is None or linear):
-        return None
-    lin = getattr(policy, "lin", None)
-    if given:
-        lin = _fitted(plan, linear)
-    if isinstance(lin, LinearModel) and lin.state_names == plant.state.names:
-        if policy is None:
-            nothing = np.zeros(len(lin.u0))
-            return lin, lambda _: nothing
-        if isinstance(policy, LinearController) and policy.dt:
-            terms = policy.terms
-            law = Compensation(len(terms.A), lambda _: terms)
-            return lin, lambda e: law.step(
-                0.0, lambda _, u: lin.y0 + lin.C @ e + lin.D @ (u - lin.u0)
-            )
+    linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
+    own, _ = feedback_of(policy)
+    lin = own
+    if not (linear is None or isinstance(linear, bool | np.bool_)):
+        lin = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
+        names = (state.names, plan.plant.actuation.names, state.frame)
+        same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
         if isinstance(policy, LinearController):
-            both, gains, offset = policy.around(lin)
-            return both, lambda e: offset + gains @ e
-        own, K = getattr(policy, "lin", None), getattr(policy, "K", None)
-        if K is not None and isinstance(own, LinearModel):
+            same = same and lin.output_names == policy.lin.output_names
+        if not same or not lin.reference.isApprox(state.reference, 1e-9):
+            raise InputError(
+                f"linear is a model of '{lin.robot}' with other states, inputs, frame or "
+                f"reference than the simulation of '{state.robot.name}'; linearise the simulated "
+                "robot with the frame and the reference of the policy"
+            )
+    elif linear is not None and not linear:
+        return None
+    if lin is not None and lin.state_names == state.names:
+        if isinstance(policy, LinearController) and policy.dt:
+            terms, model = policy.terms, lin
+            law = Compensation(len(terms.A), lambda _: terms)
+            return model, lambda e: law.step(
+                0.0, lambda _, u: model.y0 + model.C @ e + model.D @ (u - model.u0)
+            )
+        offset: Array = np.zeros(len(lin.u0))
+        gains: Array = np.zeros(lin.B.T.shape)
+        # An allocation has no K of its own, because it is nonlinear.
+        K = None if own is None else getattr(policy, "K", None)
+        if isinstance(policy, LinearController):
+            lin, gains, offset = policy.around(lin)
+        elif own is not None and K is not None:
             fed = [lin.state_names.index(name) for name in own.state_names]
-            apart = lin.x0[fed] - own.x0
-            return lin, lambda e: own.u0 - K @ (e[fed] + apart)
+            gains[:, fed], offset = -K, own.u0 - K @ (lin.x0[fed] - own.x0)
+        if policy is None or K is not None or isinstance(policy, LinearController):
+            return lin, lambda e: offset + gains @ e
     if linear is None:
         return None
     raise InputError(
@@ -281,23 +290,6 @@ def predictor(plan: Plan) -> Predictor | None:
         f"{type(policy).__name__}; leave linear= out, or give the full model of a StateFeedback, "
         "an OutputFeedback, a LinearController or no policy"
     )
-
-
-def _fitted(plan: Plan, linear: object) -> LinearModel:
-    """Return the given model, or raise `InputError` if it does not fit the simulation."""
-    lin = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
-    state, policy = plan.plant.state, plan.policy
-    names = (state.names, plan.plant.actuation.names, state.frame)
-    same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
-    if isinstance(policy, LinearController):
-        same = same and lin.output_names == policy.lin.output_names
-    if not same or not lin.reference.isApprox(state.reference, 1e-9):
-        raise InputError(
-            f"linear is a model of '{lin.robot}' with other states, inputs, frame or "
-            f"reference than the simulation of '{state.robot.name}'; linearise the simulated "
-            "robot with the frame and the reference of the policy"
-        )
-    return lin
 
 
 # After an overflow the prediction is omitted, so NumPy need not warn.

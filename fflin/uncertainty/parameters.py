@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +15,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
-from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia, sums_of
 from fflin.robot.robot import Robot
 
@@ -30,6 +29,7 @@ OF_PIECES = {
     *(f"inertia.{entry}" for entry in ENTRIES),
 }
 _ROUNDING = 1e-9
+_TURN = 2.0 * math.pi  # [rad]
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Parameters(dict[str, Parameter]):
     """Parameters of a robot by name; a body of one link can also be named by its joint."""
 
     def __init__(self, robot: Robot) -> None:
-        pieces, self._link_of = robot.pieces, robot.link_of
-        self._sums = sums_of(pieces)
-        of_pieces = (each for name, piece in pieces.items() for each in _of_piece(name, piece))
+        self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
+        self._sums = sums_of(self.pieces)
+        of_pieces = (each for item in self.pieces.items() for each in _of_piece(*item))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)
 
@@ -81,6 +81,93 @@ class Parameters(dict[str, Parameter]):
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
+
+    def refusal(self, values: Mapping[str, float]) -> str:
+        """Return why {parameter: value} is not physically realisable; an empty string if it is."""
+        try:
+            self._bodies(values)
+            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
+                self.robot(values)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    def robot(self, values: Mapping[str, float]) -> Robot:
+        """Return the robot with {parameter: value}, or raise `InputError` if it is impossible."""
+        nominal, bodies, parts = self._robot, self._bodies(values), self._by_owner(values)
+        robot = nominal.with_bodies(bodies) if bodies else nominal
+        fields: dict[str, object] = {}
+        springs: dict[str, dict[str, float]] = {"stiffness": {}, "damping": {}}
+        for joint in robot.joints:
+            own, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
+            if own and joint.mode and stiffness:
+                omega, ratio = joint.oscillation(stiffness, nominal.damping.get(joint.name, 0.0))
+                omega = _TURN * own["frequency"] if "frequency" in own else omega
+                damping = 2.0 * own.get("damping", ratio) * joint.inertia * omega
+                own = {"stiffness": joint.inertia * omega**2, "damping": damping}
+            for part in springs.keys() & own.keys():
+                springs[part][joint.name] = own[part]
+        for part, given in springs.items():
+            if given:
+                fields[part] = {**getattr(robot, part), **given}
+        inputs = list(robot.inputs)
+        for index, (item, names) in enumerate(named_inputs(robot.inputs)):
+            own = parts.get(names[0], {})
+            if isinstance(item, ReactionWheel) and "inertia" in own:
+                inputs[index] = replace(item, inertia=own["inertia"])
+                fields["inputs"] = inputs
+            if isinstance(item, Thruster) and own:
+                old = zip(AXES, item.position, strict=True)
+                position = [own.get(f"position.{axis}", x) for axis, x in old]
+                inputs[index] = replace(item, position=position)
+                fields["inputs"] = inputs
+        return robot.replace(**fields) if fields else robot
+
+    def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return {owner: {part: value}} from {parameter: value}."""
+        found: dict[str, dict[str, float]] = {}
+        for name, value in values.items():
+            found.setdefault(self[name].of, {})[self[name].part] = value
+        return found
+
+    def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
+        """Return {joint without wheels: body with changed links}, or raise `InputError`."""
+        model, bare = self._robot.model, self._robot._bare.model
+        found: dict[int, Array] = {}
+        for name, parts in self._by_owner(values).items():
+            own, piece = {*parts} & OF_PIECES, self.pieces.get(name)
+            if piece is None or not own:
+                continue
+            com, inertia = piece.frame.actInv(piece.placement.translation), piece.inertia.copy()
+            com = [parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)]
+            for entry, (i, j) in ENTRIES.items():
+                inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
+            mass, density = parts.get("mass", piece.mass), parts.get("density", 1.0)
+            if not density > 0.0:
+                raise InputError(
+                    f"the density of '{name}' has the factor {density:.4g}, expected above 0"
+                )
+            if not mass > 0.0:
+                raise InputError(f"the mass of '{name}' is {mass:.4g} kg, expected above 0")
+            # Inertias that are not changed are accepted, for example zero for a point mass. An
+            # impossible inertia may be changed unless the change makes it worse.
+            was, least = (
+                float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0])
+                / (np.trace(J) or 1.0)
+                for J in (piece.inertia, inertia)
+            )
+            sound = np.trace(inertia) > 0.0 and least >= min(-_ROUNDING, was - _ROUNDING)
+            if not sound and (inertia != piece.inertia).any():
+                raise InputError(f"the inertia of '{name}' is not physically realisable")
+            placement = pin.SE3(piece.placement.rotation, piece.frame.act(np.array(com)))
+            changed = piece._replace(placement=placement, mass=mass, inertia=inertia)
+            at = ROOT
+            if piece.joint > ROOT:
+                at = bare.getJointId(model.names[piece.joint])
+            found.setdefault(at, bare.inertias[at].toDynamicParameters())
+            found[at] += density * as_inertia(changed).toDynamicParameters()
+            found[at] -= as_inertia(piece).toDynamicParameters()
+        return {at: pin.Inertia.FromDynamicParameters(body) for at, body in found.items()}
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
@@ -107,41 +194,37 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
         about = turn @ unit_inertia @ turn.T
         value = float(piece.inertia[row, column])
         yield change(f"inertia.{entry}", "kg m^2", value, moments(0.0, np.zeros(3), about))
-    whole = m * C.T @ C + turn @ piece.inertia @ turn.T
-    yield change("density", "1", 1.0, moments(m, m * c, whole))
+    yield change("density", "1", 1.0, as_inertia(piece).toDynamicParameters())
 
 
 def _of_joints(robot: Robot) -> Iterator[Parameter]:
+    r"""Yield stiffness and damping of joints, and frequency and damping ratio of modes.
+
+    The frequency and damping ratio of a mode with inertia I are those for a link fixed in space.
+    The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
+    """
     for index, joint in enumerate(robot.joints):
+        name, inertia = joint.name, joint.inertia
         stiffness, damping, _ = (each[index].item() for each in robot.springs)
         if joint.mode and stiffness:
-            yield from _of_mode(joint, index, stiffness, damping)
+            omega, ratio = joint.oscillation(stiffness, damping)
+            yield Parameter(
+                name,
+                "frequency",
+                "Hz",
+                omega / _TURN,
+                spring=index,
+                damper=index,
+                by_stiffness=2.0 * inertia * omega * _TURN,
+                by_damping=2.0 * ratio * inertia * _TURN,
+            )
+            by_damping = 2.0 * inertia * omega
+            yield Parameter(name, "damping", "1", ratio, damper=index, by_damping=by_damping)
             continue
         per = f"/({joint.unit})" if " " in joint.unit else f"/{joint.unit}"
         force = joint.force_unit
-        yield Parameter(joint.name, "stiffness", f"{force}{per}", stiffness, spring=index)
-        yield Parameter(joint.name, "damping", f"{force} s{per}", damping, damper=index)
-
-
-def _of_mode(joint: Joint, index: int, stiffness: float, damping: float) -> Iterator[Parameter]:
-    r"""Yield the frequency and damping ratio of a mode with inertia I, for a link fixed in space.
-
-    The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
-    """
-    omega, ratio = joint.oscillation(stiffness, damping)
-    turns = 2.0 * math.pi
-    yield Parameter(
-        joint.name,
-        "frequency",
-        "Hz",
-        omega / turns,
-        spring=index,
-        damper=index,
-        by_stiffness=2.0 * joint.inertia * omega * turns,
-        by_damping=2.0 * ratio * joint.inertia * turns,
-    )
-    by_damping = 2.0 * joint.inertia * omega
-    yield Parameter(joint.name, "damping", "1", ratio, damper=index, by_damping=by_damping)
+        yield Parameter(name, "stiffness", f"{force}{per}", stiffness, spring=index)
+        yield Parameter(name, "damping", f"{force} s{per}", damping, damper=index)
 
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
@@ -175,130 +258,3 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 joint: moments(0.0, np.zeros(3), -np.outer(axis, axis)),
             }
             yield Parameter(names[0], "inertia", "kg m^2", float(item.inertia), bodies)
-
-
-class Variants:
-    """Variants of a robot with changed parameters."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._robot, self.parameters = robot, Parameters(robot)
-        self.pieces = robot.pieces
-
-    def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} is not physically realisable; an empty string if it is."""
-        try:
-            changed = self._changed(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
-                self._with(changed, values)
-        except InputError as error:
-            return str(error)
-        return ""
-
-    def robot(self, values: Mapping[str, float]) -> Robot:
-        """Return the robot with {parameter: value}, or raise `InputError` if it is impossible."""
-        return self._with(self._changed(values), values)
-
-    def _parts(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        found: dict[str, dict[str, float]] = {}
-        for name, value in values.items():
-            one = self.parameters[name]
-            found.setdefault(one.of, {})[one.part] = value
-        return found
-
-    def _changed(self, values: Mapping[str, float]) -> dict[str, tuple[Piece, float]]:
-        """Return {name: (link with changed parameters, density)}."""
-        found = {}
-        for name, parts in self._parts(values).items():
-            own = {part: value for part, value in parts.items() if part in OF_PIECES}
-            if name in self.pieces and own:
-                changed, density = found[name] = _piece(self.pieces[name], own)
-                why = _no_body(self.pieces[name], changed, name)
-                if not density > 0.0:
-                    why = f"the density of '{name}' has the factor {density:.4g}, expected above 0"
-                if why:
-                    raise InputError(why)
-        return found
-
-    def _with(
-        self, changed: Mapping[str, tuple[Piece, float]], values: Mapping[str, float]
-    ) -> Robot:
-        robot, bodies, parts = self._robot, dict[int, Array](), self._parts(values)
-        bare = robot._bare.model
-        for name, (piece, density) in changed.items():
-            at = ROOT
-            if piece.joint > ROOT:
-                at = bare.getJointId(robot.model.names[piece.joint])
-            now = as_inertia(self.pieces[name]).toDynamicParameters()
-            change = density * as_inertia(piece).toDynamicParameters() - now
-            bodies[at] = bodies.get(at, bare.inertias[at].toDynamicParameters()) + change
-        if bodies:
-            changed_bodies = pin.Inertia.FromDynamicParameters
-            robot = robot.with_bodies({at: changed_bodies(x) for at, x in bodies.items()})
-        fields: dict[str, object] = {}
-        springs = {
-            joint.name: _spring(joint, parts[joint.name], self._robot)
-            for joint in robot.joints
-            if joint.name in parts
-        }
-        for part in ("stiffness", "damping"):
-            given = {name: own[part] for name, own in springs.items() if part in own}
-            if given:
-                fields[part] = {**getattr(robot, part), **given}
-        named = named_inputs(robot.inputs)
-        inputs = [_input(item, parts.get(names[0], {})) for item, names in named]
-        if any(one is not two for one, two in zip(inputs, robot.inputs, strict=True)):
-            fields["inputs"] = inputs
-        return robot.replace(**fields) if fields else robot
-
-
-def _spring(joint: Joint, parts: Mapping[str, float], robot: Robot) -> dict[str, float]:
-    """Return the stiffness and damping of a joint with changed parameters {part: value}."""
-    stiffness = robot.stiffness.get(joint.name, 0.0)
-    if not (joint.mode and stiffness):
-        return {part: x for part, x in parts.items() if part in ("stiffness", "damping")}
-    omega, ratio = joint.oscillation(stiffness, robot.damping.get(joint.name, 0.0))
-    omega = 2.0 * math.pi * parts["frequency"] if "frequency" in parts else omega
-    inertia, ratio = joint.inertia, parts.get("damping", ratio)
-    return {"stiffness": inertia * omega**2, "damping": 2.0 * ratio * inertia * omega}
-
-
-def _piece(piece: Piece, parts: Mapping[str, float]) -> tuple[Piece, float]:
-    """Return a link with changed parameters {part: value}, and its density."""
-    own, inertia = np.array(piece.frame.actInv(piece.placement.translation)), piece.inertia.copy()
-    for at, axis in enumerate(AXES):
-        own[at] = parts.get(f"com.{axis}", own[at])
-    for entry, (i, j) in ENTRIES.items():
-        inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
-    placement = pin.SE3(piece.placement.rotation, piece.frame.act(own))
-    changed = piece._replace(
-        placement=placement, mass=parts.get("mass", piece.mass), inertia=inertia
-    )
-    return changed, parts.get("density", 1.0)
-
-
-def _no_body(before: Piece, piece: Piece, name: str) -> str:
-    """Return why a changed link is physically impossible, or an empty text if it is possible.
-
-    A link that was impossible before the change is accepted unless the change makes it worse.
-    """
-    if not piece.mass > 0.0:
-        return f"the mass of '{name}' is {piece.mass:.4g} kg, expected above 0"
-    if (piece.inertia == before.inertia).all():  # accepted, for example zero for a point mass
-        return ""
-    was, least = (
-        float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0] / (np.trace(J) or 1.0))
-        for J in (before.inertia, piece.inertia)
-    )
-    if np.trace(piece.inertia) > 0.0 and least >= min(-_ROUNDING, was - _ROUNDING):
-        return ""
-    return f"the inertia of '{name}' is not physically realisable"
-
-
-def _input(item: Any, parts: Mapping[str, float]) -> Any:
-    """Return a thruster with a changed position, a wheel with a changed inertia, or the input."""
-    if "inertia" in parts:
-        return replace(item, inertia=parts["inertia"])
-    if not isinstance(item, Thruster):
-        return item
-    position = [parts.get(f"position.{a}", x) for a, x in zip(AXES, item.position, strict=True)]
-    return replace(item, position=position)

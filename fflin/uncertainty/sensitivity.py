@@ -17,7 +17,7 @@ from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped
 from fflin.base.writing import as_path
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
-from fflin.uncertainty.derivatives import ModelDerivatives, difference
+from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest pole, count as equal and have no derivative.
@@ -219,7 +219,7 @@ class Sensitivity:
             names = [name for name, one in self.parameters.items() if one.bodies]
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise InputError(f"names is {names!r}, expected a list, such as ['base.mass']")
-        return {name: difference(self._derivatives, self._one(name)) for name in names}
+        return {name: self._derivatives.difference(self._one(name)) for name in names}
 
     def __str__(self) -> str:
         """Return `table` with its default arguments."""

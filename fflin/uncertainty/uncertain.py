@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import numpy as np
 
@@ -13,14 +12,11 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.dynamics.state import StateMap
-from fflin.linear.linearization import linearize, prepare
-from fflin.linear.model import LinearModel
-from fflin.robot.mass_properties import Piece
+from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
-from fflin.uncertainty.fraction import Block, Range, fraction
-from fflin.uncertainty.lft import LFT
-from fflin.uncertainty.parameters import Parameter, Variants
+from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
+from fflin.uncertainty.parameters import Parameter, Parameters
 from fflin.uncertainty.worst import Worst, searched
 
 # Ranges are refused if there are more rejected draws per valid draw than this.
@@ -51,7 +47,7 @@ class Uncertain:
 
     robot: Robot
     blocks: tuple[Block, ...]
-    _variants: Variants
+    _parameters: Parameters
 
     def __repr__(self) -> str:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
@@ -81,8 +77,12 @@ class Uncertain:
             fixed point for all values of the parameters. The operating point can depend on the
             parameters because of gravity, an orbit, stored momentum or a deflected spring.
         """
-        robot = self.robot
-        lin = linearize(robot, q)
+        robot, lin = self.robot, linearize(self.robot, q)
+        if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in robot.outputs):
+            raise InputError(
+                "an output depends on accelerations or masses, which the LFT cannot represent; "
+                "remove it with robot.replace(outputs=)"
+            )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
@@ -92,7 +92,8 @@ class Uncertain:
                 "makes the point an equilibrium only for some values of the parameters; remove "
                 "this effect from the robot, or linearise each robot of samples(n)"
             )
-        return _lft(self, lin)
+        ready = Prepared(robot, frame=lin.frame, reference=None, moving=False)
+        return linear_fractional(lin, ready, self._parameters.pieces, self.blocks)
 
     def at(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with the given parameter values {parameter or pattern: value}.
@@ -106,27 +107,24 @@ class Uncertain:
         InputError
             If the inertia of a body with these parameters is not physically realisable.
         """
-        return self._variants.robot(self._each(numbers("values", values, "parameter", "value")))
-
-    def _each(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return {parameter: value} with names and patterns expanded."""
-        known, found = self._variants.parameters, dict[str, float]()
+        known, found = self._parameters, dict[str, float]()
         blocks = {each.name: each for each in self.blocks if each.name not in known}
-        for key, value in values.items():
+        for key, value in numbers("values", values, "parameter", "value").items():
             if key in blocks:
                 found |= blocks[key].values(value)
             else:
                 found |= dict.fromkeys(known.find(key), value)
-        return found
+        return known.robot(found)
 
     def makes(self, delta: Array) -> bool:
         """Return whether the robot with the deltas (k,) is physically realisable."""
         return not self._refusal(delta)
 
     def _refusal(self, delta: Array) -> str:
-        pairs = zip(self.blocks, delta, strict=True)
-        of_blocks = [block.values(block.middle + block.half * d) for block, d in pairs]
-        return self._variants.refusal({name: x for of in of_blocks for name, x in of.items()})
+        values = dict[str, float]()
+        for block, d in zip(self.blocks, delta, strict=True):
+            values |= block.values(block.middle + block.half * d)
+        return self._parameters.refusal(values)
 
     def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
         """Return deltas (n, k) drawn uniformly from [-1, 1], and the number of rejected draws.
@@ -271,18 +269,29 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
             given[key] = value
     if not given:
         raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
-    variants, alone, together = Variants(robot), dict[str, Block](), list[Block]()
+    parameters, alone, together = Parameters(robot), dict[str, Block](), list[Block]()
     for key, value in given.items():
         own, tied = untied(key, value)
-        ones = [variants.parameters[name] for name in variants.parameters.find(key)]
+        ones = [parameters[name] for name in parameters.find(key)]
         if tied:
             together.append(_tied(key, ones, own))
         else:
             for one in ones:
                 _, middle, half = each = _range(one, own)
                 alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
-    made = Uncertain(robot, (*alone.values(), *together), variants)
-    _refuse_overlap(variants.pieces, made.ranges)
+    made = Uncertain(robot, (*alone.values(), *together), parameters)
+    names = [each.parameter.name for each in made.ranges]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(
+            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
+            "only one of these ranges"
+        )
+    pieces = parameters.pieces
+    for name, other in permutations({each.parameter.of for each in made.ranges} & pieces.keys(), 2):
+        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
+            raise InputError(
+                f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
+            )
     if why := made._refusal(np.zeros(len(made.blocks))):
         raise InputError(
             f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
@@ -290,28 +299,12 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     return made
 
 
-def _refuse_overlap(pieces: Mapping[str, Piece], ranges: tuple[Range, ...]) -> None:
-    names = [each.parameter.name for each in ranges]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(
-            f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
-            "only one of these ranges"
-        )
-    asked = {each.parameter.of for each in ranges} & pieces.keys()
-    for name, other in permutations(asked, 2):
-        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
-            raise InputError(
-                f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
-            )
-
-
 def _range(one: Parameter, value: object) -> Range:
     if one.part[:9] == "direction":
-        said = (
-            "rotates a unit vector, so that the model is not a rational function of it; use "
-            "fflin.sensitivity for this parameter"
+        raise InputError(
+            f"'{one.name}' rotates a unit vector, so that the model is not a rational function of "
+            "it; use fflin.sensitivity for this parameter"
         )
-        raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
@@ -336,7 +329,7 @@ def _range(one: Parameter, value: object) -> Range:
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
 
-def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
+def _tied(key: str, parameters: list[Parameter], value: object) -> Block:
     """Return the block of tied parameters, which have a common delta."""
     ranges = [_range(one, value) for one in parameters]
     units = {one.unit for one in parameters}
@@ -348,38 +341,7 @@ def _tied(key: str, parameters: list[Parameter], value: Any) -> Block:
                 "range, such as 0.2 for 20 %"
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
-    relative = abs(float(value))
+    relative = abs(number(key, value))
     # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))
-
-
-def _lft(of: Uncertain, lin: LinearModel) -> LFT:
-    ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
-    if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
-        feels = "an output depends on accelerations or masses, which the LFT cannot represent"
-        raise InputError(f"{feels}; remove it with robot.replace(outputs=)")
-    form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
-    nv, nw = len(lin.A) // 2, len(form.z[0])
-    x, w, u = form.a
-    A = np.vstack((lin.A[:nv], x))
-    return LFT(
-        A=A,
-        B1=np.vstack((np.zeros((nv, nw)), w)),
-        B2=np.vstack((np.zeros((nv, u.shape[1])), u)),
-        C1=form.z[0],
-        D11=form.z[1],
-        D12=form.z[2],
-        C2=np.array(lin.C),
-        D21=np.zeros((len(lin.C), nw)),
-        D22=np.array(lin.D),
-        parameters=of.names,
-        units=tuple(each.unit for each in of.blocks),
-        repeats=np.array([float(each.repeats) for each in of.blocks]),
-        middle=np.array([each.middle for each in of.blocks]),
-        half=np.array([each.half for each in of.blocks]),
-        state_names=lin.state_names,
-        input_names=lin.input_names,
-        output_names=lin.output_names,
-        robot=lin.robot,
-    )

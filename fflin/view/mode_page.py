@@ -7,23 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.analysis.modes import energy_by_body
+from fflin.analysis.modes import energies_of
 from fflin.base.errors import InputError
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import (
-    Recorder,
-    build_page,
-    corner_points,
-    packed,
-    rounded,
-    stage_info,
-    subtitle,
-)
-from fflin.view.playback import body_poses
-from fflin.view.scene import Drawing, Visualizer, body_paths
+from fflin.view.page import Page, packed, subtitle
+from fflin.view.scene import Drawing, body_poses
 
 if TYPE_CHECKING:
     from fflin.analysis.modes import Mode, Modes
@@ -53,37 +44,28 @@ def mode_page(
             f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
             "joints a stiffness"
         )
-    window, sent = Recorder(), set[str]()
-    scenery = Visualizer(window=window)
-    drawing = Drawing(robot, scenery["robot"], sent=sent)
+    page = Page(robot, scene, tool, lin.frame)
     at_rest = body_poses(robot, robot.model.createData(), lin.q)
-    drawing.place(at_rest)
-    Drawing(robot, scenery["rest"], "ghost", sent).place(at_rest)
-    about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
-    info = stage_info(
-        robot, drawing, at_rest, scene=scene, subtitle=about, tool=tool, frame=lin.frame
-    )
-    swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
-    energies = energy_by_body(robot, lin, [mode.shape for mode in found.vibrations])
-    points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
-    info |= {
-        "mode": "modes",
-        "period": _PERIOD,
-        "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
-        "points": rounded(np.concatenate(points), info["size"]),
-        "modes": [
-            {
-                "frequency": mode.frequency,
-                "damping": mode.damping_ratio,
-                "unstable": bool(mode.unstable),
-                "energy": list(energy.items())[:2],
-                "shape": _shape(mode, lin),
-                "poses": packed(poses),
-            }
-            for mode, energy, poses in zip(found.vibrations, energies, swings, strict=True)
-        ],
-    }
-    return build_page(info, window.commands()), drawing.notes
+    page.drawing.place(at_rest)
+    page.draw(robot, "rest", "ghost").place(at_rest)
+    page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
+    swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
+    energies = energies_of(robot, lin, [mode.shape for mode in found.vibrations])
+    points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
+    modes = [
+        {
+            "frequency": mode.frequency,
+            "damping": mode.damping_ratio,
+            "unstable": bool(mode.unstable),
+            "energy": list(energy.items())[:2],
+            "shape": _shape(mode, lin),
+            "poses": packed(poses),
+        }
+        for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
+    ]
+    corners = np.concatenate(points)
+    html = page.html("modes", corners, period=_PERIOD, bodies=page.nodes, modes=modes)
+    return html, page.drawing.notes
 
 
 def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
@@ -101,8 +83,8 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
 
     # Displacement of the corners per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    rest = corner_points(drawing, body_poses(robot, data, lin.q))
-    moved = np.array([corner_points(drawing, each) - rest for each in poses(small)])
+    rest = drawing.points(body_poses(robot, data, lin.q))
+    moved = np.array([drawing.points(each) - rest for each in poses(small)])
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [
         {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.impact import Impact
-from fflin.dynamics.state import StateMap
-from fflin.robot.joints import find_frame
+from fflin.dynamics.impact import Capture, Impact, inertia_at
+from fflin.dynamics.integrators import CommutatorFree4
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.robot.joints import find_frame, find_joint, frame_index
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.page import (
-    Recorder,
-    build_page,
-    corner_points,
-    packed,
-    rounded,
-    stage_info,
-    subtitle,
-    thrusters,
-)
+from fflin.simulation.motion import Motion
+from fflin.simulation.run import Plant
+from fflin.view.page import Page, packed, subtitle
 from fflin.view.panel import panel
-from fflin.view.playback import Playback, body_poses, frame_indices, payloads, play_back
-from fflin.view.scene import Drawing, Visualizer, animation, body_paths
+from fflin.view.scene import animation, body_poses
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
-    from fflin.simulation.motion import Motion
-
-# A drawn robot with its poses (N, njoints - 1, 7).
-Moving: TypeAlias = "tuple[Drawing, Array]"
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
@@ -40,6 +31,13 @@ FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 # Length of the largest force's arrow. The camera follows the base by default if its path is longer
 # than _FAR. Both are in robot sizes.
 ARROW, _FAR = 0.62, 20.0
+
+# Limits of one integration step of a payload's flight before capture: time [s], and phase [rad] of
+# the fastest oscillation.
+_STEP, _SWING = 0.05, 0.3
+
+# Largest number of frames; more would enlarge the file without a visible effect.
+_MOST_FRAMES = 3000
 
 
 def motion_page(
@@ -57,100 +55,64 @@ def motion_page(
     shown = frame_indices(motion.t, fps, speed)
     frame = cast("Frame", motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
-    film = play_back(robot, state, t, motion.q[shown], motion.u[shown], tool)
+    film = play_back(robot, state, motion.q[shown], motion.u[shown], tool)
     goal = _target(motion, state, shown) if target is None else target[None]
     data = robot.model.createData()
     # One pose if the target is fixed, or one for each frame.
     goals = np.array([body_poses(robot, data, each) for each in goal])
 
-    window, sent = Recorder(), set[str]()
-    scenery = Visualizer(window=window)
-    drawing = Drawing(robot, scenery["robot"], sent=sent)
-    ghosts = _ghosts(scenery, motion, state, shown, goals, sent)
-    held = {
-        caught.prefix: (
-            Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent, caught.prefix),
-            at,
-        )
-        for caught, at in payloads(motion, shown)
-    }
-    moving = [(drawing, film.poses), *ghosts, *held.values()]
+    page = Page(robot, scene, tool, frame)
+    drawing, moving = page.drawing, [(page.drawing, film.poses)]
+    if len(goals):
+        ghost = page.draw(robot, "target", "ghost")
+        ghost.place(goals[0])
+        moving += [(ghost, goals)] if len(goals) > 1 else []
+    if motion.linear is not None:
+        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
+        poses = np.array([body_poses(robot, data, each) for each in predicted])
+        moving.append((page.draw(robot, "linear", "linear"), poses))
+    held = []
+    for caught, poses in payloads(motion, frame, shown):
+        name = caught.prefix
+        held.append((page.draw(caught.payload, f"held/{name}", "held", name), poses))
+    moving += held
     clips = []
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
-    window.record(animation(clips))
+    page.window.record(animation(clips))
 
     # Robots of the phases, if known. After a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
-    info = stage_info(
-        robot,
-        drawing,
-        film.poses[0],
-        scene=scene,
-        subtitle=about[0],
-        tool=tool,
-        frame=frame,
-        held=[each for each, _ in held.values()],
-    )
-    size = info["size"]
-    points = _points(film, size, (drawing, goals), held.values())
-    info["floor"][2] = float(points[:, 2].min())
+    page.set_stage(film.poses[0], about[0], [each for each, _ in held])
+    corners = [frame_points(page, film)]
+    for each, rows in ((drawing, goals), *held):
+        corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
+    points = np.concatenate(corners)
+    page.floor[2] = float(points[:, 2].min())
     if follow is None:
         # If the whole of a long path were in view, the robot would be only a dot.
-        follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
+        follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
-        points = frame_points(drawing, film, size, follow=True)
-    info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, size, goals[:1] if motion.phases else goals)
-    info |= {
-        "mode": "motion",
-        "t": packed(t),
-        "speed": speed,
-        "follow": follow,
-        "points": rounded(points, size),
-        "target": len(goals) > 0,
-        "linear": motion.linear is not None,
-        "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
-        "held": list(held),
-    }
+        points = frame_points(page, film, follow=True)
+    html = page.html(
+        "motion",
+        points,
+        **panel(robot, motion, shown, goal),
+        **marks(page, film, goals[:1] if motion.phases else goals),
+        t=packed(t),
+        speed=speed,
+        follow=follow,
+        target=len(goals) > 0,
+        linear=motion.linear is not None,
+        phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
+        held=[each.prefix for each, _ in held],
+    )
     drawn = [drawing, *(each for each, _ in moving[1:] if each.robot.urdf)]
-    notes = dict.fromkeys(note for each in drawn for note in each.notes)
-    return build_page(info, window.commands()), tuple(notes)
-
-
-def _ghosts(
-    scenery: Visualizer,
-    motion: Motion,
-    state: StateMap,
-    shown: Array,
-    goals: Array,
-    sent: set[str],
-) -> list[Moving]:
-    """Draw the robot at the target and at the linear prediction; return the moving drawings."""
-    robot, moving = state.robot, list[Moving]()
-    if len(goals):
-        ghost = Drawing(robot, scenery["target"], "ghost", sent)
-        ghost.place(goals[0])
-        moving += [(ghost, goals)] if len(goals) > 1 else []
-    if motion.linear is not None:
-        data = robot.model.createData()
-        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
-        poses = np.array([body_poses(robot, data, each) for each in predicted])
-        moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
-    return moving
-
-
-def _points(film: Playback, size: float, goal: Moving, held: Iterable[Moving]) -> Array:
-    """Return corners (M, 3) of the robot, its target and its payloads at some frames."""
-    points = [frame_points(goal[0], film, size)]
-    for drawing, rows in (goal, *held):
-        step = max(1, len(rows) // 24)
-        points += [corner_points(drawing, poses) for poses in rows[::step]]
-    return np.concatenate(points)
+    return html, tuple(dict.fromkeys(note for each in drawn for note in each.notes))
 
 
 def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
@@ -160,34 +122,32 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
-def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
+def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: body corners and force tips."""
-    chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
+    chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:
         base = film.poses[index, 0, :3]
-        tip = base + ARROW * size * film.force[index] / strongest
+        tip = base + ARROW * page.size * film.force[index] / strongest
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
-        points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
+        points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
     return np.concatenate(points)
 
 
-def marks(
-    robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
-) -> dict[str, Any]:
+def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
     trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
     if len(goals) > 1:
         trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
-    if tool:
+    if page.tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
         if followed:
-            joint, at = find_frame(robot.model, tool)
+            joint, at = find_frame(page.robot.model, page.tool)
             ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
             followed["tool"] = np.array(ends)
     arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
-    paths = body_paths(robot)
+    size = page.size
     most = float(np.abs(film.thrust).max(initial=0.0))
     return {
         "trails": [
@@ -210,15 +170,101 @@ def marks(
             if np.any(values)
         ],
         "plumes": [
-            {
-                "path": ["meshcat", "robot", paths[joint - ROOT]],
-                "position": position.tolist(),
-                "direction": direction.tolist(),
-                "values": packed(film.thrust[:, k]),
-                "most": most,
-                "name": name,
-            }
-            for k, (name, joint, position, direction) in enumerate(thrusters(robot))
+            {**nozzle, "values": packed(film.thrust[:, k]), "most": most, "name": name}
+            for k, (name, nozzle) in enumerate(page.nozzles)
             if most
         ],
     }
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Poses, trails and forces of a motion at N frames."""
+
+    poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
+    com: Array  # (N, 3) [m]
+    tool: Array  # (N, 3) origin of the tool [m]
+    force: Array  # (N, 3) [N] on the base, in world axes
+    torque: Array  # (N, 3) [N m] on the base, in world axes
+    thrust: Array  # (N, k) [N] of k thrusters
+
+
+def frame_indices(t: Array, fps: float, speed: float) -> Array:
+    """Return the indices of the samples at t (N,) [s] that are nearest to a film's frames."""
+    duration = float(t[-1] - t[0])
+    count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
+    wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
+    after = np.clip(np.searchsorted(t, wanted), 1, len(t) - 1) if len(t) > 1 else np.zeros(1, int)
+    if len(t) > 1:
+        after -= wanted - t[after - 1] < t[after] - wanted
+    return np.unique(after)
+
+
+def play_back(robot: Robot, state: StateMap, q: Array, u: Array, tool: str | None) -> Playback:
+    """Compute the data of an animation from rows of a motion; wrenches are in the state's frame."""
+    model, data = robot.model, robot.model.createData()
+    tool_id = frame_index(model, tool) if tool else None
+    groups = Actuation(state).groups
+
+    def frame(q_k: Array, u_k: Array) -> tuple[Array, ...]:
+        poses = body_poses(robot, data, q_k)
+        com = pin.centerOfMass(model, data, q_k).copy()
+        base = data.oMi[ROOT]
+        end = base if tool_id is None else pin.updateFramePlacement(model, data, tool_id)
+        force, torque = (
+            (state.reference if relative else base).rotation @ u_k[groups[kind]]
+            if kind in groups
+            else np.zeros(3)
+            for kind, relative in (("F_b", state.axes[1]), ("tau_b", state.axes[0]))
+        )
+        return poses, com, end.translation.copy(), force, torque
+
+    frames = [frame(q_k, u_k) for q_k, u_k in zip(q, u, strict=True)]
+    thrust = u[:, groups.get("thrust", np.zeros(0, dtype=int))]
+    poses, com, tools, force, torque = map(np.array, zip(*frames, strict=True))
+    return Playback(poses, com, tools, force, torque, thrust)
+
+
+def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
+    """Yield each capture and the poses (N, njoints - 1, 7) of its payload at the rows `shown`."""
+    parts = motion._phases
+    first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
+    for k, caught in enumerate(parts):
+        if not isinstance(caught, Capture):
+            continue
+        before = motion.t[shown[shown < first[k]]] - motion.t[first[k]]
+        poses = _flight(caught, frame, before)
+        for part, start, end in zip(parts[k:], first[k:], first[k + 1 :], strict=False):
+            rows = shown[(shown >= start) & (shown < end)] - start
+            poses += _held(caught, part._robot, part.q[rows]) if len(rows) else []
+        yield caught, np.array(poses)
+
+
+def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
+    """Return the poses of an undamped, free payload at times [s] before its capture."""
+    payload = caught.payload.replace(damping=0.0)
+    data, state = payload.create_data(), StateMap(payload, frame=frame)
+    q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
+    none = np.zeros(len(plant.actuation.names))
+    softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of its frequencies
+    for time in t[::-1].tolist():
+        steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
+        for _ in range(steps):
+            take = CommutatorFree4(payload.model, (time - now) / steps).step
+            q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
+        now = time
+        poses.insert(0, body_poses(payload, data, q))
+    return poses
+
+
+def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
+    """Return the poses of a payload on the robot that carries it, at rows of q (N, nq)."""
+    model, data = robot.model, robot.model.createData()
+    names = [f"{caught.prefix}.{name}" for name in list(caught.payload.model.names)[ROOT + 1 :]]
+    places = [find_frame(model, caught.prefix), *(find_joint(model, name) for name in names)]
+    poses = []
+    for q in rows:
+        pin.forwardKinematics(model, data, q)
+        poses.append(np.array([pin.SE3ToXYZQUAT(data.oMi[joint] * at) for joint, at in places]))
+    return poses

@@ -9,7 +9,7 @@ import base64
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
@@ -21,17 +21,19 @@ import umsgpack
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
-from fflin.view.scene import Drawing, body_paths
+from fflin.view.scene import Drawing, Visualizer
 
 Lowered = dict[str, Any]
+
+# Wheels at the same point are drawn apart along their axes, at this distance in robot sizes.
+_APART = 0.1
 
 # Directions to the camera and to the sun, in world axes.
 VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
@@ -43,30 +45,6 @@ _SCRIPTS = (
 )
 
 
-def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
-    """Build the page from `info`, which its scripts read, and from the commands of a `Recorder`.
-
-    The page may open connections only to `connect`.
-    """
-    info = {**info, "commands": [_base64(command) for command in commands]}
-    # In a script element, only the end tag and the start of a comment have a special meaning.
-    data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    fields = {
-        "title": escape(info["title"]),
-        "scene": info["scene"],
-        "mode": info["mode"],
-        "connect": connect or "'none'",
-        "style": _asset("style.css"),
-        "meshcat": _meshcat(),
-        "scripts": _scripts(),
-        "data": data,
-    }
-    parts = _asset("page.html").split("{{")
-    return parts[0] + "".join(
-        fields[name] + rest for name, _, rest in (part.partition("}}") for part in parts[1:])
-    )
-
-
 def packed(array: Array) -> str:
     """Encode an array in single precision for the function `floats` of the page."""
     return _base64(np.ascontiguousarray(array, dtype="<f4").tobytes())
@@ -76,24 +54,24 @@ def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode("ascii")
 
 
-@cache
 def _asset(name: str) -> str:
     return files("fflin.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 @cache
-def _scripts() -> str:
+def _fixed() -> dict[str, str]:
+    """Return the parts of a page that are the same for all pages: its style and its scripts."""
+    bundle = files("meshcat").joinpath("viewer", "dist", "main.min.js")
+    meshcat = bundle.read_text(encoding="utf-8")
     body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
     body = re.sub(r"(?m)^ *(//.*\n)?", "", body)  # indentation and comments
-    # A function scope separates the names in these scripts from the names in meshcat's bundle.
-    return f'(() => {{\n"use strict";\nconst THREE = MeshCat.THREE;\n{body}\nmain();\n}})();'
-
-
-@cache
-def _meshcat() -> str:
-    bundle = files("meshcat").joinpath("viewer", "dist", "main.min.js")
-    script = bundle.read_text(encoding="utf-8")
-    return script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    head = '"use strict";\nconst THREE = MeshCat.THREE;'
+    return {
+        "style": _asset("style.css"),
+        "meshcat": meshcat.replace("</script", "<\\/script").replace("<!--", "<\\!--"),
+        # A function scope separates the names in these scripts from the names in meshcat's bundle.
+        "scripts": f"(() => {{\n{head}\n{body}\nmain();\n}})();",
+    }
 
 
 class Recorder:
@@ -151,95 +129,122 @@ def subtitle(robot: Robot) -> str:
     return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
 
 
-def rounded(points: Array, size: float) -> list[list[float]]:
-    """Round points (M, 3) to the digits that a robot of the given size [m] needs."""
-    digits = max(4, 4 - math.floor(math.log10(size)))
-    found: list[list[float]] = points.round(digits).tolist()
-    return found
+class Page:
+    """Page of a robot in a scene, with its drawings, and the entries that its scripts read.
 
+    `entries` begins with the entries of the stage, which follow from the poses of the first frame.
+    """
 
-def corner_points(drawing: Drawing, poses: Array) -> Array:
-    """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
-    return np.concatenate(
-        [
-            np.array([placement.act(corner) for corner in corners])
-            for joint, corners in zip(drawing.bodies, drawing.corners, strict=True)
-            for placement in [pin.XYZQUATToSE3(poses[joint - ROOT])]
+    def __init__(
+        self,
+        robot: Robot,
+        scene: str,
+        tool: str | None,
+        frame: str | None,
+        forward: Callable[[bytes], None] | None = None,
+    ) -> None:
+        self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
+        self.window, self._sent = Recorder(forward), set[str]()
+        self.meshcat = Visualizer(window=self.window)
+        self.drawing = self.draw(robot, "robot")
+        # Path of each body's node, in the order of Pinocchio's joints from 1 on.
+        self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
+        self.entries: dict[str, object] = {}
+        # Each thruster's name, with its node and its position and force direction there.
+        self.nozzles: list[tuple[str, dict[str, object]]] = [
+            (
+                name,
+                {
+                    "path": self.nodes[joint - ROOT],
+                    "position": position.tolist(),
+                    "direction": direction.tolist(),
+                },
+            )
+            for name, joint, position, direction in thrusters(robot)
         ]
-    )
+        self.floor = [0.0, 0.0, 0.0]  # [m] point of the floor below the robot
+        self.size = 1.0  # [m] radius of the robot in the first frame
 
+    def draw(self, robot: Robot, node: str, look: str = "real", prefix: str = "") -> Drawing:
+        """Draw a robot below a node of the scene."""
+        return Drawing(robot, self.meshcat[node], look, self._sent, prefix)
 
-def stage_info(
-    robot: Robot,
-    drawing: Drawing,
-    poses: Array,
-    *,
-    scene: str,
-    subtitle: str,
-    tool: str | None,
-    frame: str | None = None,
-    held: Sequence[Drawing] = (),
-) -> dict[str, Any]:
-    """Return the page's stage parameters from the poses (njoints - 1, 7) of the first frame."""
-    points = corner_points(drawing, poses)
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre = (low + high) / 2.0
-    size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
-    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, object]()
-    field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
-    if field and robot.orbit:
-        # The z axis points away from the central body, and the x axis along the orbit.
-        radial, along, normal = field.axes.T
-        sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
-        far = robot.orbit.radius / robot.orbit.body_radius
-        orbit = {
-            "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
-            "orbit": {"body": robot.orbit.body, "distance": far, "rate": robot.orbit.mean_motion},
-        }
-    return {
-        **orbit,
-        **equipment(robot, [drawing, *held], tool, size),
-        "title": robot.name,
-        "subtitle": subtitle,
-        "scene": scene,
-        "size": size,
-        "centre": centre.tolist(),
-        "floor": [*centre[:2].tolist(), float(low[2])],
-        "sun": sun.tolist(),
-        "direction": direction.tolist(),
-        "base": ["meshcat", "robot", body_paths(robot)[0]],
-    }
-
-
-# Wheels at the same point are drawn apart along their axes, at this distance in robot sizes.
-_APART = 0.1
-
-
-def equipment(
-    robot: Robot, drawings: list[Drawing], tool: str | None, size: float
-) -> dict[str, object]:
-    """Return the marks of a page: axes at base and tool, nozzles, wheels and selectable links."""
-    paths = body_paths(robot)
-    found = [(paths[0], pin.SE3.Identity(), 0.3)]
-    if tool:
-        joint, placement = find_frame(robot.model, tool)
-        found.append((paths[joint - ROOT], placement, 0.12))
-    return {
-        "triads": [
-            {"path": _node(path), "length": share * size, **_placed(placement)}
-            for path, placement, share in found
-        ],
-        "nozzles": [
-            {
-                "path": _node(paths[joint - ROOT]),
-                "position": position.tolist(),
-                "direction": direction.tolist(),
+    def set_stage(self, poses: Array, about: str, held: Sequence[Drawing] = ()) -> None:
+        """Set the entries of the stage by the poses (njoints - 1, 7) of the first frame."""
+        robot, nodes = self.robot, self.nodes
+        points = self.drawing.points(poses)
+        low, high = points.min(axis=0), points.max(axis=0)
+        centre = (low + high) / 2.0
+        size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
+        self.size, self.floor = size, [*centre[:2].tolist(), float(low[2])]
+        sun, direction, orbit = np.array(SUN), np.array(VIEWS[self.scene]), dict[str, object]()
+        field = field_of(robot, frame_of(robot, self.frame)) if self.scene == "space" else None
+        if field and robot.orbit:
+            # The z axis points away from the central body, and the x axis along the orbit.
+            radial, along, normal = field.axes.T
+            sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
+            far = robot.orbit.radius / robot.orbit.body_radius
+            rate = robot.orbit.mean_motion
+            orbit = {
+                "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
+                "orbit": {"body": robot.orbit.body, "distance": far, "rate": rate},
             }
-            for _, joint, position, direction in thrusters(robot)
-        ],
-        "wheels": _wheels(robot, size),
-        "links": {name: link for drawing in drawings for name, link in drawing.links.items()},
-    }
+        triads = [{"path": nodes[0], "length": 0.3 * size, **_placed(pin.SE3.Identity())}]
+        if self.tool:
+            joint, placement = find_frame(robot.model, self.tool)
+            triad = {"path": nodes[joint - ROOT], "length": 0.12 * size, **_placed(placement)}
+            triads.append(triad)
+        named, wheels = named_wheels(robot.inputs), list[dict[str, object]]()
+        for name, wheel in named:
+            joint, at = find_frame(robot.model, wheel.frame)
+            axis, several = np.array(wheel.axis), [each.frame for _, each in named]
+            apart = _APART * size * (several.count(wheel.frame) > 1)
+            placement = at * pin.SE3(turned_to(axis), apart * axis)
+            # The wheel spins with its body if its speed is a state.
+            spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
+            wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
+        self.entries = {
+            **orbit,
+            "triads": triads,
+            "nozzles": [nozzle for _, nozzle in self.nozzles],
+            "wheels": wheels,
+            "links": {k: link for each in (self.drawing, *held) for k, link in each.links.items()},
+            "title": robot.name,
+            "subtitle": about,
+            "scene": self.scene,
+            "size": size,
+            "centre": centre.tolist(),
+            "sun": sun.tolist(),
+            "direction": direction.tolist(),
+            "base": nodes[0],
+        }
+
+    def html(self, mode: str, points: Array, **entries: object) -> str:
+        """Return the page, with further entries; its camera shows the points (M, 3)."""
+        # A live page gets its commands from its server. Other pages open no connections.
+        live, digits = mode == "live", max(4, 4 - math.floor(math.log10(self.size)))
+        info = {
+            **self.entries,
+            "floor": self.floor,
+            "mode": mode,
+            "points": points.round(digits).tolist(),
+            **entries,
+            "commands": [] if live else [_base64(each) for each in self.window.commands()],
+        }
+        # In a script element, only the end tag and the start of a comment have a special meaning.
+        data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+        fields = {
+            "title": escape(self.robot.name),
+            "scene": self.scene,
+            "mode": mode,
+            "connect": "'self' ws:" if live else "'none'",
+            **_fixed(),
+            "data": data,
+        }
+        parts = _asset("page.html").split("{{")
+        return parts[0] + "".join(
+            fields[name] + rest for name, _, rest in (part.partition("}}") for part in parts[1:])
+        )
 
 
 def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
@@ -254,31 +259,6 @@ def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
             direction = placement.rotation @ np.array(item.direction)
             found.append((names[len(found)], joint, position, direction))
     return found
-
-
-def _wheels(robot: Robot, size: float) -> list[dict[str, Any]]:
-    """Return the wheels at their frames, with the spinning body if the wheel's speed is a state."""
-    named, paths = named_wheels(robot.inputs), body_paths(robot)
-    frames = [wheel.frame for _, wheel in named]
-    found = []
-    for name, wheel in named:
-        joint, frame = find_frame(robot.model, wheel.frame)
-        axis = np.array(wheel.axis)
-        apart = _APART * size * (frames.count(wheel.frame) > 1)
-        placement = frame * pin.SE3(turned_to(axis), apart * axis)
-        rotor = robot.model.getJointId(name) - ROOT if name in robot.wheels else None
-        found.append(
-            {
-                "path": _node(paths[joint - ROOT]),
-                "spins": None if rotor is None else _node(paths[rotor]),
-                **_placed(placement),
-            }
-        )
-    return found
-
-
-def _node(path: str) -> list[str]:
-    return ["meshcat", "robot", path]
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:

@@ -6,16 +6,17 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from warnings import warn
+
+import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, instance, number, positive, truth, whole
 from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
-from fflin.dynamics.state import StateMap
-from fflin.robot.joints import find_frame
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -157,8 +158,6 @@ def visualize(
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     opened = None if open is None else truth("open", open)
     check_tool(robot, tool)
-    from fflin.view.playback import default_tool
-
     tool = tool or default_tool(robot)
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
@@ -170,9 +169,10 @@ def visualize(
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
-        how: Any = {"scene": scene, "tool": tool, "follow": bool(follow), "frame": frame}
         pace = positive("speed", 1.0 if speed is None else speed)
-        live = Live(robot, start, **how, speed=pace, port=port)
+        live = Live(
+            robot, start, scene=scene, tool=tool, follow=follow, speed=pace, port=port, frame=frame
+        )
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -196,8 +196,9 @@ def visualize(
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        how = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
-        page, notes = motion_page(robot, motion, **how, tool=tool)
+        page, notes = motion_page(
+            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
+        )
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
@@ -239,6 +240,23 @@ def check_tool(robot: Robot, tool: str | None) -> None:
     """Raise `UnknownNameError` if the robot has no frame `tool`."""
     if tool is not None:
         find_frame(robot.model, tool)
+
+
+def default_tool(robot: Robot) -> str | None:
+    """Return the name of the tool frame: "tool", or the last link of the longest chain."""
+    model = robot.model
+    if robot.n == 0:
+        return None
+    if model.existFrame("tool"):
+        return "tool"
+    depths = [len(support) for support in model.supports.tolist()]
+    deepest = max(range(ROOT, model.njoints), key=lambda joint: depths[joint])
+    links = [
+        frame.name
+        for frame in model.frames.tolist()
+        if frame.parentJoint == deepest and frame.type == pin.FrameType.BODY
+    ]
+    return links[-1] if links else None
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:

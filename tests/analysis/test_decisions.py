@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.analysis.names import shape
+from fflin.analysis.mechanics import shape
 from tests.support import decisions
 from tests.support.mechanisms import mechanical, motors
 from tests.support.messages import says

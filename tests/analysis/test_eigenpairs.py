@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from fflin.analysis.eigenpairs import nonzero_eigenpairs
+from fflin.analysis.modes import nonzero_eigenpairs
 
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 

@@ -206,7 +206,7 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "v": np.zeros((3, r.nv))}, r"\(3, 15"),
         (
             lambda r: {"q": damaged(r, 0, 7, 0.0), "u": np.full((40, 15), np.inf)},
-            r"u\[0, 0\]",
+            r"row 0: u\[0\]",
         ),
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "workers": 0}, "workers"),
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "executor": 3}, "executor"),

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Actuation
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.4, -0.5), np.array([0.1, -0.2, 0.3]))
 

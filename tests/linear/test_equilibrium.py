@@ -8,8 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from tests.support.robots import BUNDLED, FRAMES, random_pose, random_tree
 
 

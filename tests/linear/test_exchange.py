@@ -8,8 +8,8 @@ import pytest
 
 import fflin
 from fflin.dynamics.aba import Aba
+from fflin.linear.check import scaled_condition
 from fflin.linear.tool_coordinates import TOOLS
-from fflin.linear.verification import scaled_condition
 from tests.support.robots import (
     BUNDLED,
     FRAMES,

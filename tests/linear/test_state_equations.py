@@ -8,10 +8,10 @@ import pytest
 
 import fflin
 from fflin.base.rotation import skew
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.coordinates import Standing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
-from fflin.linear.state_equations import assemble, at_rest
+from fflin.dynamics.state import Actuation
+from fflin.linear.state_equations import assemble
 from tests.support.robots import random_point, random_pose
 
 COUNT = 5
@@ -47,7 +47,7 @@ def rows_of(robot, frame, own):
 def assembled(state, actuation, chart, nu, u, rates, moving):
     """A, the lower half of B, and f0, of rates that are left as they are."""
     A = np.zeros((*nu.shape[:-1], state.nx, state.nx))
-    A[:] = at_rest(state)
+    A[..., : state.nx // 2, :] = fflin.Linearizer(state.robot).prepared.rest["A"][: state.nx // 2]
     A[..., state.nx // 2 :, :] = rates.slopes
     own = AccelerationDerivatives(
         rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity

@@ -13,7 +13,7 @@ from fflin.kernel.compiled import ENGINES
 from fflin.kernel.tree import batch_tree
 from fflin.simulation import lanes, run
 from fflin.simulation.plan import Plan, SimulationOptions
-from fflin.simulation.plant import Plant
+from fflin.simulation.run import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory

@@ -1,6 +1,6 @@
 """The first integrals of a motion: the momentum, and the line of the centre of mass."""
 
-import json
+import dataclasses
 import math
 
 import numpy as np
@@ -244,15 +244,10 @@ def motion_text(motion):
     return motion_report(motion)
 
 
-def test_a_file_that_does_not_tell_the_drift_is_loaded_and_shown_without_it(tmp_path):
+def test_a_motion_without_the_drift_is_saved_and_shown_without_it(tmp_path):
     motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
-    motion.save(tmp_path / "m.json")
-    record = json.loads((tmp_path / "m.json").read_text())
-    del record["com_drift"], record["sha256"]
-    (tmp_path / "m.json").write_text(json.dumps(record))
-    loaded = fflin.Motion.load(tmp_path / "m.json")
+    dataclasses.replace(motion, com_drift=np.zeros(0)).save(tmp_path / "m.mat")
+    loaded = fflin.Motion.load(tmp_path / "m.mat")
     assert loaded.com_drift.shape == (0,)
     assert "centre of mass" not in motion_text(loaded)
     np.testing.assert_array_equal(loaded.momentum_drift, motion.momentum_drift)
-    loaded.save(tmp_path / "again.mat")
-    assert fflin.Motion.load(tmp_path / "again.mat").com_drift.shape == (0,)

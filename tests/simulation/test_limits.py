@@ -326,14 +326,6 @@ def test_limits_are_saved_and_loaded_and_older_files_have_none(tmp_path, ending)
     assert not bare.saturated
 
 
-def test_a_file_that_has_no_limits_is_loaded(tmp_path):
-    fflin.simulate(fflin.load("cubesat"), duration=0.02).save(tmp_path / "m.npz")
-    with np.load(tmp_path / "m.npz") as file:
-        kept = {key: file[key] for key in file.files if "limit" not in key and key != "sha256"}
-    np.savez(tmp_path / "older.npz", **kept)
-    assert fflin.Motion.load(tmp_path / "older.npz").limits.shape == (0, 2)
-
-
 def held_up(**limits):
     """An arm under gravity, its model about the point where its inputs hold it, and their u."""
     robot = fflin.load("canadarm2", gravity=(0.0, 0.0, -0.05), limits=limits)

@@ -6,16 +6,17 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.linear.verification import Nonlinear
+from fflin.dynamics.aba import Aba
+from fflin.linear.nonlinear import Nonlinear
 
 
 def flown(robot, q, v, u, duration):
     """The state (nx,) after a time under a constant input, by DOP853 and ABA in the chart."""
     lin = fflin.linearize(robot, q, v, u, reference=pin.SE3.Identity())
     state = fflin.StateMap(robot)
-    model = Nonlinear(state, lin)
+    model = Nonlinear(Aba(state), lin)
     found = solve_ivp(
-        lambda _, x: model(x, lin.u0),
+        lambda _, x: model.rates(np.r_[x, lin.u0][None])[0],
         (0.0, duration),
         lin.x0,
         method="DOP853",

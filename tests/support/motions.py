@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Actuation
 from fflin.simulation.motion import Motion
 from tests.support.robots import random_point
 from tests.support.weights import unit_weights
@@ -62,6 +62,7 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         urdf_sha256=robot.urdf_sha256,
         stopped="",
         wheels=tuple(robot.wheels),
+        wheel_inertias=np.array(list(robot.wheels.values())),
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
     )

@@ -69,7 +69,7 @@ def test_their_rows_of_C_as_by_differences(name, frame):
     link = "link_3" if name == "servicer_7dof" else "gripper"
     for part in ("mass", "com.y", "inertia.xz", "density"):
         one = S.parameters[f"{link}.{part}"]
-        step = 2e-3 / S._derivatives.bodies.fraction(one.bodies)
+        step = 2e-3 / S._derivatives.fraction(one.bodies)
         for at, got in ((2, S[one.name].dC), (5, S[one.name].dy0)):
             expected = fourth_order(
                 lambda s, one=one, at=at: everything(of(changed(robot, one.bodies, s)))[at], step
@@ -120,7 +120,7 @@ def test_sampled_models_of_other_masses_and_their_poles():
     def at(size):
         return fflin.linearize(changed(robot, one.bodies, size), q, v, u).discretize(0.2)
 
-    slope, step = S["link_2.mass"], 2e-3 / S._derivatives.bodies.fraction(one.bodies)
+    slope, step = S["link_2.mass"], 2e-3 / S._derivatives.fraction(one.bodies)
     for part in ("A", "B", "f0"):
         expected = fourth_order(lambda s, part=part: getattr(at(s), part), step)
         assert np.abs(getattr(slope, f"d{part}") - expected).max() < 1e-7 * np.abs(expected).max()
@@ -166,7 +166,7 @@ def test_outputs_that_weigh_in_orbit_as_by_differences():
     S = fflin.sensitivity(fflin.linearize(robot, q, v, frame="lvlh"))
     for name in ("link_3.mass", "base.com.y"):
         one = S.parameters[name]
-        step = 2e-3 / S._derivatives.bodies.fraction(one.bodies)
+        step = 2e-3 / S._derivatives.fraction(one.bodies)
         for at, got in ((2, S[name].dC), (5, S[name].dy0)):
 
             def of(size, one=one, at=at):

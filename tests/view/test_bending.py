@@ -11,7 +11,7 @@ import fflin
 from fflin.robot.robot import ROOT
 from fflin.view.mode_page import mode_page
 from fflin.view.panel import panel
-from fflin.view.playback import body_poses
+from fflin.view.scene import body_poses
 from fflin.view.shapes import shapes
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.playback import default_tool
+from fflin.view.visualize import default_tool
 from tests.support.browser import Watched
 from tests.support.motions import HOME, led, settling
 

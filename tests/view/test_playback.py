@@ -6,8 +6,8 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
+from fflin.view.motion_page import play_back
 from fflin.view.page import thrusters
-from fflin.view.playback import play_back
 from tests.support.robots import random_point, random_pose
 
 FRAMES = ("hybrid", "local", "world")
@@ -23,7 +23,7 @@ def test_arrows_are_the_wrench_that_acts_on_the_base(robots, frame):
     reference = random_pose(rng, 40.0)
     u = rng.normal(size=6)
     state = fflin.StateMap(robot, reference=reference, frame=frame)
-    film = play_back(robot, state, np.zeros(1), q[None], u[None], "tool")
+    film = play_back(robot, state, q[None], u[None], "tool")
     lin = fflin.linearize(robot, q, np.zeros(robot.nv), u, frame=frame, reference=reference)
     # f0 has the accelerations of the base: d omega/dt and d v/dt in the frame's axes.
     base = pin.XYZQUATToSE3(film.poses[0, 0])
@@ -59,7 +59,7 @@ def test_the_centre_of_mass_moves_straight_when_nothing_pushes(robots):
     count = len(qs)
     u = np.zeros((count, 6 + robot.n))
     state = fflin.StateMap(robot)
-    film = play_back(robot, state, dt * np.arange(count), np.array(qs), u, "tool")
+    film = play_back(robot, state, np.array(qs), u, "tool")
     way = film.com - film.com[0]
     direction = way[-1] / np.linalg.norm(way[-1])
     off = way - np.outer(way @ direction, direction)
@@ -87,5 +87,5 @@ def test_plumes_stand_where_thrusters_push(robots):
     np.testing.assert_allclose(data.oMi[joint].act(position), tool.act(np.array([0.1, -0.2, 0.3])))
     np.testing.assert_allclose(data.oMi[joint].rotation @ direction, tool.rotation @ [0, 0.6, 0.8])
     state = fflin.StateMap(robot)
-    film = play_back(robot, state, np.zeros(1), q[None], u[None, :2], "tool")
+    film = play_back(robot, state, q[None], u[None, :2], "tool")
     assert film.thrust.tolist() == [[u[1]]]

@@ -194,17 +194,10 @@ class FlexibleAppendage(_Part):
         """
         from fflin.robot.equipment.nastran import read_superelement
 
-        found = read_superelement(op4, asm, origin=origin, modes=modes, length=length, mass=mass)
-        return cls(
-            frame,
-            found.frequency,
-            found.L[:3],
-            found.L[3:],
-            damping,
-            name,
-            inertia=found.inertia,
-            rigid=rigid,
+        frequency, L, inertia = read_superelement(
+            op4, asm, origin=origin, modes=modes, length=length, mass=mass
         )
+        return cls(frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid)
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -325,7 +318,7 @@ class Slosh(_Part):
         object.__setattr__(self, "damping", ratio)
         position = three_numbers(f"position of {what}", self.position)
         object.__setattr__(self, "position", position)
-        axis = unit_vector(f"axis of {what}", self.axis, "the axis of the tank")
+        axis = unit_vector(f"axis of {what}", self.axis)
         object.__setattr__(self, "axis", axis)
 
     @classmethod
@@ -392,7 +385,7 @@ class Slosh(_Part):
         for what, value in (sizes | {"acceleration": acceleration}).items():
             positive(f"{what} of the tank", value)
         k = _FIRST_ROOT / radius
-        along = unit_vector("axis of the tank", axis, "the direction from its bottom up")
+        along = unit_vector("axis of the tank", axis)
         liquid = density * math.pi * radius**2 * height
         share = 2.0 * math.tanh(k * height) / (k * height * (_FIRST_ROOT**2 - 1.0))
         omega = math.sqrt(acceleration * k * math.tanh(k * height))
@@ -468,10 +461,8 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(entries)
 
 
-def _text(what: str, value: Any) -> str:
+def _text(what: str, value: object) -> str:
     printable = isinstance(value, str) and value.strip() and value.isprintable()
-    if not printable or (what == "name" and set(value) & set("*?[]")):
-        raise InputError(
-            f"{what} of an appendage is {value!r}, expected a name, without *, ?, [ and ]"
-        )
+    if not printable or (what == "name" and set(str(value)) & set("*?[]")):
+        raise InputError(f"{what} of an appendage is {value!r}, expected a name without *?[]")
     return str(value)

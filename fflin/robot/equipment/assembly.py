@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -57,8 +57,10 @@ _LIGHTEST = 1e-6
 _NONE = 1e-14
 
 # Fields of a robot by names of joints, and the groups of names in their keys.
-_BY_JOINT = ("stiffness", "damping", "rest", "urdf_damping", "limits", "weights")
-_STATES = ("point", "target", "start")
+_BY_NAME = (
+    *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
+    *("point", "target", "start"),
+)
 _GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
 
 
@@ -75,9 +77,7 @@ def equipped(
     the entries of joints that no longer exist.
     """
     before, bare = robot._bare, bare or robot._bare
-    checked = checked_inputs(
-        robot.inputs if inputs is None else inputs, bare.joint, bare.joint_names, robot.passive
-    )
+    checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
     model, joints, followers = bare.model, bare.joints, bare.followers
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
     parts = mounted_wheels(model, bodies, checked)
@@ -100,9 +100,7 @@ def equipped(
         followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
     gone = [name for name in robot.joint_names if name not in names]
-    fields = {
-        name: _without(getattr(robot, name), gone, names) for name in (*_BY_JOINT, *_STATES) if gone
-    }
+    fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
     modes = {joint.name for joint in robot.modes}
     # Without new appendages, the springs of modes may have been replaced since.
     for name in ("stiffness", "damping") if appendages is not None else ():
@@ -123,13 +121,9 @@ def equipped(
     )
 
 
-def _without(
-    of: Mapping[str, object], gone: Iterable[str], left: Iterable[str]
-) -> dict[str, object]:
+def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
     """Remove keys that match only removed joints, from a mapping and its nested mappings."""
-    removed, others = (
-        [f"{group}.{name}" for group in _GROUPS for name in names] for names in (gone, left)
-    )
+    removed, others = ([f"{of}.{x}" for of in _GROUPS for x in names] for names in (gone, left))
     return {
         key: _without(value, gone, left) if isinstance(value, Mapping) else value
         for key, value in of.items()
@@ -141,9 +135,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     """Return a robot with other flexible appendages and slosh, whose modes are joints."""
     given = [appendages] if isinstance(appendages, Appendage) else appendages
     if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
-        raise InputError(
-            f"appendages is {given!r}, expected a sequence of FlexibleAppendage and Slosh"
-        )
+        raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
     bare, taken = robot._bare, set[int]()
     for item in given:
         if not isinstance(item, FlexibleAppendage) or not item.rigid or item.inertia is None:

@@ -42,9 +42,7 @@ class Mounted(NamedTuple):
         return self.joint.name
 
 
-def with_mounted(
-    model: pin.Model, bodies: Sequence[pin.Inertia], parts: Sequence[Mounted]
-) -> pin.Model:
+def with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
     """Return a model with a new joint for each part, and with new inertias of the old bodies.
 
     The new joints have no frames yet.

@@ -137,9 +137,7 @@ def read_pose(element: Element) -> Pose:
     if origin is None:
         return Pose()
     given = origin.attributes
-    xyz, rpy = (
-        origin.vector(name, 3) if name in given else (0.0, 0.0, 0.0) for name in ("xyz", "rpy")
-    )
+    xyz, rpy = (origin.vector(x, 3) if x in given else (0.0, 0.0, 0.0) for x in ("xyz", "rpy"))
     if (longest := max(map(abs, xyz))) > _FARTHEST:
         raise origin.error(
             f"xyz of {origin.title} has an entry of {longest:g} m, expected at most "
@@ -152,9 +150,7 @@ def read_pose(element: Element) -> Pose:
     quaternion = origin.vector("quat_xyzw", 4)
     length = float(np.hypot.reduce(quaternion))
     if not abs(length - 1.0) <= _QUATERNION_SLACK:
-        raise origin.error(
-            f"quat_xyzw of {origin.title} has length {length:g}, expected 1; normalise it"
-        )
+        raise origin.error(f"quat_xyzw of {origin.title} has length {length:g}, expected 1")
     return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
 
 
@@ -181,9 +177,7 @@ def read_joint(element: Element) -> JointElement:
         joint = joint._replace(axis=found.vector("xyz", 3))
         length = math.hypot(*joint.axis)
         if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
-            raise found.error(
-                f"{found.title} has length {length:g}; expected a direction, such as 0 0 1"
-            )
+            raise found.error(f"{found.title} has length {length:g}, expected a direction as 0 0 1")
     if found := element.find("dynamics", "damping", "friction"):
         damping, friction = (found.number(x, 0.0) for x in ("damping", "friction"))
         if min(damping, friction) < 0.0:

@@ -211,9 +211,7 @@ def _origin(pose: Pose) -> str:
     return _tag("origin", {"xyz": pose.xyz, "quat_xyzw": pose.quaternion})
 
 
-def _tag(
-    tag: str, attributes: Mapping[str, str | float | tuple[float, ...]], inside: str = ""
-) -> str:
+def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:
     """Return an element; the standard library's functions would load many modules."""
     text = f"<{tag}"
     for name, value in attributes.items():

@@ -93,10 +93,7 @@ class Element:
                         f"{child.title} has an unknown attribute {quoted(name)}; known: "
                         f"{', '.join(attributes)}; correct it or remove it"
                     )
-                child.note(
-                    f"attribute {quoted(name)} of <{tag}> is ignored, because it is not part of "
-                    "URDF"
-                )
+                child.note(f"attribute {quoted(name)} of <{tag}> is not in URDF and ignored")
         return found[0] if found else None
 
     def require(self, tag: str, *attributes: str) -> Element:
@@ -112,7 +109,7 @@ class Element:
             near = child.tag not in known and ":" not in child.tag
             if near and (meant := nearest(child.tag.lower(), known, 0.85)):
                 raise child.error(
-                    f"<{child.tag}> in {self.title} is not known to URDF; did you mean <{meant}>?"
+                    f"<{child.tag}> in {self.title} is unknown; did you mean <{meant}>?"
                 )
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
@@ -143,10 +140,8 @@ class Element:
         values = tuple(map(decimal, entries))
         wrong = [entry for entry, x in zip(entries, values, strict=True) if not abs(x) <= _LARGEST]
         if len(values) != size or wrong:
-            right = len(values) == size
-            given = (
-                quoted(wrong[0]) if right else f"{quoted(text)}, which has {len(values)} entries"
-            )
+            given = f"{quoted(text)}, which has {len(values)} entries"
+            given = quoted(wrong[0]) if len(values) == size else given
             wanted = "a finite number, such as 0.5," if size == 1 else f"{size} finite numbers"
             raise self.error(
                 f"{name} of {self.title} is {given}; expected {wanted} of at most {_LARGEST:g}"
@@ -198,14 +193,10 @@ def parse(document: bytes, origin: str) -> Element:
         line = parser.CurrentLineNumber
         element = Element(tag, attributes, line, origin, owner, notes=top.notes)
         if len(opened) > _DEPTH_LIMIT:
-            raise element.error(
-                f"elements are nested more than {_DEPTH_LIMIT} deep; check for a missing end tag"
-            )
+            raise element.error(f"more than {_DEPTH_LIMIT} elements deep; find the missing end tag")
         nonlocal count
         if (count := count + 1) > _ELEMENT_LIMIT:
-            raise element.error(
-                f"the file has more than {_ELEMENT_LIMIT} elements; reduce it to the robot"
-            )
+            raise element.error(f"more than {_ELEMENT_LIMIT} elements; reduce it to the robot")
         opened[-1].children.append(element)
         opened.append(element)
 
@@ -236,7 +227,5 @@ def parse(document: bytes, origin: str) -> Element:
     except UrdfError:
         raise
     except (LookupError, ValueError) as error:
-        raise UrdfError(
-            f"{origin}: its declared encoding cannot be read ({error}); save it as UTF-8"
-        ) from None
+        raise UrdfError(f"{origin}: cannot be decoded ({error}); save it as UTF-8") from None
     return top.children[0]

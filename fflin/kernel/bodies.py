@@ -1,0 +1,420 @@
+"""Inertia M by composite rigid bodies, and accelerations and forces of the bodies by RNEA.
+
+All vectors are in base axes, so no vector is rotated from joint to joint. Moments are about the
+joints. About the base's origin, the inertia of a light tool on a long arm would lose digits. Row i
+of the packed M holds the nonzero entries up to the diagonal. Their columns are the coordinates on
+the path from the base to i. If a coordinate is on this path, its own path is the beginning of this
+path.
+
+References
+----------
+R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sections 6.2 and 6.5.
+"""
+
+from __future__ import annotations
+
+from fflin.kernel import vectors as vec
+from fflin.kernel.lanes import inlined, load, splat, store
+from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
+
+# Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
+# by c alone, and Psi''.
+VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
+# Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
+# moment and force without c, and moment and force by c alone.
+MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
+
+
+@inlined
+def _inertia(work, at, place, bodies, first):
+    """Write a body's inertia about its joint in base axes: m, m c, and R I R^T."""
+    axes = vec.get_columns(work, place)
+    store(work, at, load(bodies, first))
+    vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
+    xx, xy, xz = vec.get3(bodies, first + 4)
+    yy, yz, zz = vec.get3(bodies, first + 7)
+    u = vec.product(axes, (xx, xy, xz))
+    v = vec.product(axes, (xy, yy, yz))
+    w = vec.product(axes, (xz, yz, zz))
+    _, yy, yz = vec.product(axes, (u[1], v[1], w[1]))
+    zz = vec.product(axes, (u[2], v[2], w[2]))[2]
+    vec.put3(work, at + 4, vec.product(axes, (u[0], v[0], w[0])))
+    vec.put3(work, at + 7, (yy, yz, zz))
+
+
+@inlined
+def spatial_inertia_times(work, at, motion):
+    """Return a spatial inertia times a motion vector, as moment and force."""
+    m, h = load(work, at), vec.get3(work, at + 1)
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
+    w, v = motion
+    turning = vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
+    return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
+
+
+@inlined
+def outwards(work, tree, q):
+    """Write the poses and the inertias of all bodies, from the base outwards."""
+    places, own = tree.places, tree.own
+    one, zero = splat(work, 1.0), splat(work, 0.0)
+    vec.put3(work, places, (1.0, 0.0, 0.0))
+    vec.put3(work, places + 3, (0.0, 1.0, 0.0))
+    vec.put3(work, places + 6, (0.0, 0.0, 1.0))
+    _inertia(work, own, places, tree.bodies, 0)
+    for body in range(1, len(tree.parent)):
+        at = places + body * PLACE
+        value = load(q, tree.index[body])
+        if tree.unbounded[body]:
+            cosine, sine = value, load(q, tree.index[body] + 1)
+        elif tree.turns[body] != 0.0:
+            cosine, sine = vec.cosine_and_sine(tree.turns[body] * value)
+        else:
+            cosine, sine = one, zero
+        first = body * PLACE
+        axes = vec.get_columns(work, places + tree.parent[body] * PLACE)
+        x = vec.product(axes, vec.get3(tree.fixed, first))
+        y = vec.product(axes, vec.get3(tree.fixed, first + 3))
+        z = vec.product(axes, vec.get3(tree.fixed, first + 6))
+        origin = vec.product(axes, vec.get3(tree.fixed, first + 9))
+        vec.put3(work, at, vec.plus(vec.times(x, cosine), vec.times(y, sine)))
+        vec.put3(work, at + 3, vec.minus(vec.times(y, cosine), vec.times(x, sine)))
+        vec.put3(work, at + 6, z)
+        vec.put3(work, at + 9, vec.plus(origin, vec.times(z, tree.slides[body] * value)))
+        _inertia(work, own + body * INERTIA, at, tree.bodies, body * INERTIA)
+
+
+@inlined
+def inwards(work, tree):
+    """Write the packed M and the composite inertias, from the tips inwards."""
+    bodies = len(tree.parent)
+    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    zero = splat(work, 0.0)
+    for index in range(tree.entries):
+        store(work, packed + index, 0.0)
+    for index in range(bodies * INERTIA):
+        store(work, inertias + index, load(work, tree.own + index))
+    pair = 0
+    for body in range(bodies - 1, 0, -1):
+        at = inertias + body * INERTIA
+        place = places + body * PLACE
+        z = vec.get3(work, place + 6)
+        axis = vec.times(z, tree.turns[body]), vec.times(z, tree.slides[body])
+        moment, force = spatial_inertia_times(work, at, axis)
+        # Add the composite inertia, expressed at the parent's joint, to the parent's inertia.
+        m, h, d = load(work, at), vec.get3(work, at + 1), vec.get3(work, place + 9)
+        xx, xy, xz = vec.get3(work, at + 4)
+        yy, yz, zz = vec.get3(work, at + 7)
+        e = vec.plus(h, vec.times(d, m))
+        px, py, pz = d[0] * (h[0] + e[0]), d[1] * (h[1] + e[1]), d[2] * (h[2] + e[2])
+        xy = xy - (d[0] * e[1] + h[0] * d[1])
+        xz = xz - (d[0] * e[2] + h[0] * d[2])
+        yz = yz - (d[1] * e[2] + h[1] * d[2])
+        to = inertias + tree.parent[body] * INERTIA
+        vec.add(work, to, m)
+        vec.add3(work, to + 1, e)
+        vec.add3(work, to + 4, (xx + (py + pz), xy, xz))
+        vec.add3(work, to + 7, (yy + (px + pz), yz, zz + (px + py)))
+        above = body
+        while above > 0:
+            place = places + above * PLACE
+            z = vec.get3(work, place + 6)
+            value = tree.turns[above] * vec.dot(z, moment)
+            value = value + tree.slides[above] * vec.dot(z, force)
+            vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
+            pair += 1
+            # Move the moment to the parent's joint.
+            moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
+            above = tree.parent[above]
+        start, share = packed + tree.target[pair], tree.share[pair]
+        pair += 1
+        vec.add3(work, start, vec.times(moment, share))
+        vec.add3(work, start + 3, vec.times(force, share))
+    # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
+    m = load(work, inertias)
+    hx, hy, hz = vec.get3(work, inertias + 1)
+    xx, xy, xz = vec.get3(work, inertias + 4)
+    yy, yz, zz = vec.get3(work, inertias + 7)
+    vec.put6(work, packed, ((xx, xy, yy), (xz, yz, zz)))
+    vec.put6(work, packed + 6, ((zero, hz, -hy), (m, -hz, zero)))
+    vec.put3(work, packed + 12, (hx, zero, m))
+    vec.put6(work, packed + 15, ((hy, -hx, zero), (zero, zero, m)))
+    for index in range(len(tree.row)):
+        at = packed + (tree.row[index] + tree.depth[index])
+        vec.add(work, at, tree.armature[index])
+
+
+@inlined
+def factorise(work, tree):
+    """Factorise M = L^T D L: replace the packed M by the unit L, and write 1 / D at `scaled`."""
+    packed, scaled = tree.packed, tree.scaled
+    for k in range(len(tree.row) - 1, -1, -1):
+        row, depth = packed + tree.row[k], tree.depth[k]
+        inverse = 1.0 / load(work, row + depth)
+        store(work, scaled + (tree.row[k] + depth), inverse)
+        store(work, row + depth, 1.0)
+        for t in range(depth - 1, -1, -1):
+            share = load(work, row + t) * inverse
+            other = packed + tree.row[tree.path[tree.row[k] + t]]
+            for s in range(t + 1):
+                at = other + s
+                store(work, at, load(work, at) - share * load(work, row + s))
+            store(work, row + t, share)
+
+
+@inlined
+def solve(work, tree, x):
+    """Replace a force f at x by the acceleration M^-1 f; M must be factorised."""
+    packed, size = tree.packed, len(tree.row)
+    for k in range(size - 1, -1, -1):
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            at = x + tree.path[row + t]
+            store(work, at, load(work, at) - load(work, packed + row + t) * value)
+        pivot = load(work, tree.scaled + row + tree.depth[k])
+        store(work, x + k, value * pivot)
+    for k in range(size):
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            value = value - load(work, packed + row + t) * load(work, x + tree.path[row + t])
+        store(work, x + k, value)
+
+
+@inlined
+def invert_factor(work, tree):
+    """Replace L by U = L^-1, and write V = L^-1 D^-1."""
+    packed, scaled = tree.packed, tree.scaled
+    zero = splat(work, 0.0)
+    for k in range(len(tree.row)):
+        row, depth = packed + tree.row[k], tree.depth[k]
+        for t in range(depth):
+            total = zero - load(work, row + t)
+            for s in range(t + 1, depth):
+                other = packed + tree.row[tree.path[tree.row[k] + s]]
+                total = total - load(work, row + s) * load(work, other + t)
+            store(work, row + t, total)
+            above = tree.path[tree.row[k] + t]
+            pivot = load(work, scaled + (tree.row[above] + tree.depth[above]))
+            store(work, scaled + (tree.row[k] + t), total * pivot)
+
+
+@inlined
+def multiply(work, tree, judged):
+    """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
+    packed, scaled, square = tree.packed, tree.scaled, tree.square
+    size = len(tree.row)
+    coupling = splat(work, 0.0)
+    for i in range(size):
+        left = packed + tree.row[i]
+        for j in range(i + 1):
+            right = scaled + tree.row[j]
+            total = load(work, left) * load(work, right)
+            for t in range(1, tree.common[i, j]):
+                total = total + load(work, left + t) * load(work, right + t)
+            store(work, square + (i * size + j), total)
+            store(work, square + (j * size + i), total)
+            if i == j:
+                coupling = coupling + total * load(work, tree.diagonal + i)
+    store(work, judged, coupling)
+
+
+@inlined
+def joint_axis(work, tree, body):
+    """Return the spatial axis of a joint, angular and linear, per unit of its coordinate."""
+    z = vec.get3(work, tree.places + (body * PLACE + 6))
+    share = tree.factor[body]
+    return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
+
+
+@inlined
+def motion_cross(velocity, along):
+    """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
+    w, v = velocity
+    return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
+
+
+@inlined
+def at_joint(work, at, place):
+    """Shift the parent's motion vector at `at` to the origin of a joint."""
+    w, v = vec.get6(work, at)
+    return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
+
+
+@inlined
+def at_parent(work, place, force):
+    """Shift a spatial force from a joint's origin to the origin of its parent."""
+    return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
+
+
+@inlined
+def move_bodies(work, tree, nu):
+    """Write velocities and accelerations without c, from the base outwards, for v_b = 0."""
+    for entry in range(MOTION):
+        store(work, tree.motion + entry, 0.0)
+    vec.put3(work, tree.motion, vec.get3(nu, 0))
+    for body in range(1, len(tree.parent)):
+        at = tree.motion + body * MOTION
+        above = tree.motion + tree.parent[body] * MOTION
+        place = tree.places + body * PLACE
+        rate = load(nu, tree.coordinate[body])
+        axis = joint_axis(work, tree, body)
+        velocity = at_joint(work, above + VELOCITY, place)
+        psi = motion_cross(velocity, axis)
+        bias = at_joint(work, above + BIAS, place)
+        vec.put6(work, at + VELOCITY, vec.plus6(velocity, vec.times6(axis, rate)))
+        vec.put6(work, at + PSI, psi)
+        vec.put6(work, at + BIAS, vec.plus6(bias, vec.times6(psi, rate)))
+
+
+@inlined
+def load_bodies(work, tree):
+    """Write the inertial force of each single body, including its gyroscopic torque."""
+    for body in range(len(tree.parent)):
+        at = tree.load + body * LOAD + FORCE
+        moving = tree.motion + body * MOTION
+        own = tree.own + body * INERTIA
+        w, v = vec.get6(work, moving + VELOCITY)
+        turning, p = spatial_inertia_times(work, own, (w, v))
+        moment, force = spatial_inertia_times(work, own, vec.get6(work, moving + BIAS))
+        moment = vec.plus(moment, vec.plus(vec.cross(w, turning), vec.cross(v, p)))
+        vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
+    for index in range(len(tree.stored_body)):
+        body = tree.stored_body[index]
+        turning = vec.cross(
+            vec.get3(work, tree.motion + body * MOTION), stored_momentum(work, tree, index)
+        )
+        vec.add3(work, tree.load + body * LOAD + FORCE, turning)
+
+
+@inlined
+def load_carried(work, tree, u):
+    """Subtract the body-fixed wrenches of inputs from the forces of the bodies."""
+    for index in range(len(tree.wrench_body)):
+        push = vec.times6(carried_wrench(work, tree, index), -load(u, tree.input[index]))
+        vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
+
+
+@inlined
+def load_momenta(work, tree):
+    """Write the momentum, the moments G and the stored momentum of each single body."""
+    zero = splat(work, 0.0)
+    for body in range(len(tree.parent)):
+        at = tree.load + body * LOAD
+        own = tree.own + body * INERTIA
+        w, v = vec.get6(work, tree.motion + body * MOTION + VELOCITY)
+        h = vec.get3(work, own + 1)
+        vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
+        # The matrix of second moments of mass is tr(I) / 2 times the identity, minus I.
+        xx, xy, xz = vec.get3(work, own + 4)
+        yy, yz, zz = vec.get3(work, own + 7)
+        trace = 0.5 * (xx + yy + zz)
+        x = trace - xx, -xy, -xz
+        y = -xy, trace - yy, -yz
+        z = -xz, -yz, trace - zz
+        vec.put3(work, at + MOMENTS, vec.plus(vec.times(v, h[0]), vec.cross(w, x)))
+        vec.put3(work, at + MOMENTS + 3, vec.plus(vec.times(v, h[1]), vec.cross(w, y)))
+        vec.put3(work, at + MOMENTS + 6, vec.plus(vec.times(v, h[2]), vec.cross(w, z)))
+        vec.put3(work, at + STORED, (zero, zero, zero))
+        vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
+    for index in range(len(tree.stored_body)):
+        at = tree.load + tree.stored_body[index] * LOAD + STORED
+        vec.add3(work, at, stored_momentum(work, tree, index))
+
+
+@inlined
+def stored_momentum(work, tree, index):
+    """Return a stored momentum in base axes."""
+    axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
+    return vec.product(axes, vec.get3(tree.stored, 3 * index))
+
+
+@inlined
+def carried_wrench(work, tree, index):
+    """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
+    axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
+    moment, force = vec.get6(tree.wrench, 6 * index)
+    return vec.product(axes, moment), vec.product(axes, force)
+
+
+@inlined
+def write_columns(work, tree):
+    """Write the generalised force per unit of each body-fixed input."""
+    count = len(tree.wrench_body)
+    for entry in range(len(tree.row) * count):
+        store(work, tree.columns + entry, 0.0)
+    for index in range(count):
+        body, wrench = tree.wrench_body[index], carried_wrench(work, tree, index)
+        while body > 0:
+            value = vec.dot6(joint_axis(work, tree, body), wrench)
+            vec.add(work, tree.columns + tree.coordinate[body] * count + index, value)
+            wrench = at_parent(work, tree.places + body * PLACE, wrench)
+            body = tree.parent[body]
+        for axis in range(3):
+            entry = tree.columns + axis * count + index
+            store(work, entry, wrench[0][axis])
+            store(work, entry + 3 * count, wrench[1][axis])
+
+
+@inlined
+def collect(work, tree):
+    """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
+    for index in range(len(tree.row)):
+        store(work, tree.bias + index, 0.0)
+    for body in range(len(tree.parent) - 1, 0, -1):
+        force = vec.get6(work, tree.load + body * LOAD + FORCE)
+        value = vec.dot6(joint_axis(work, tree, body), force)
+        vec.add(work, tree.bias + tree.coordinate[body], value)
+        to = tree.load + tree.parent[body] * LOAD + FORCE
+        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
+    vec.add6(work, tree.bias, vec.get6(work, tree.load + FORCE))
+
+
+@inlined
+def collect_momenta(work, tree):
+    """Sum the bodies' momenta over subtrees, from the tips inwards."""
+    for body in range(len(tree.parent) - 1, 0, -1):
+        at = tree.load + body * LOAD
+        above = tree.load + tree.parent[body] * LOAD
+        d = vec.get3(work, tree.places + body * PLACE + 9)
+        p = vec.get3(work, at + MOMENTUM)
+        vec.add3(work, above + MOMENTUM, p)
+        vec.add3(work, above + STORED, vec.get3(work, at + STORED))
+        columns = vec.get_columns(work, at + MOMENTS)
+        for index in range(3):
+            column = vec.plus(columns[index], vec.times(p, d[index]))
+            vec.add3(work, above + MOMENTS + 3 * index, column)
+
+
+@inlined
+def accelerate_bodies(work, tree):
+    """Add what c contributes to accelerations and Psi'' (outwards), then to forces (inwards)."""
+    vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
+    for body in range(1, len(tree.parent)):
+        at = tree.motion + body * MOTION
+        above = tree.motion + tree.parent[body] * MOTION
+        place = tree.places + body * PLACE
+        rate = load(work, tree.c + tree.coordinate[body])
+        axis = joint_axis(work, tree, body)
+        added = at_joint(work, above + ADDED, place)
+        acceleration = vec.plus6(added, at_joint(work, above + BIAS, place))
+        velocity = at_joint(work, above + VELOCITY, place)
+        psi = vec.get6(work, at + PSI)
+        vec.put6(
+            work,
+            at + PSI2,
+            vec.plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)),
+        )
+        vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
+    for body in range(len(tree.parent) - 1, 0, -1):
+        at = tree.load + body * LOAD
+        inertia = tree.inertias + body * INERTIA
+        place = tree.places + body * PLACE
+        above = tree.motion + tree.parent[body] * MOTION
+        rate = load(work, tree.c + tree.coordinate[body])
+        own = spatial_inertia_times(work, inertia, vec.times6(joint_axis(work, tree, body), rate))
+        carried = vec.plus6(vec.get6(work, at + CARRIED), own)
+        shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
+        vec.add6(work, at + FORCE, vec.plus6(carried, shared))
+        if tree.parent[body] > 0:
+            to = tree.load + tree.parent[body] * LOAD + CARRIED
+            vec.add6(work, to, at_parent(work, place, carried))
