@@ -53,9 +53,8 @@ _PUBLIC = {
         "control.gain": "Gain",
         "control.plan": "plan",
         "control.mpc": "mpc",
-        "control.tvlqr": "tvlqr tvkalman",
-        "control.gain_schedule": "GainSchedule FilterSchedule",
-        "control.kalman": "kalman Estimator lqg Compensator",
+        "control.tvlqr": "tvlqr GainSchedule FilterSchedule",
+        "control.kalman": "tvkalman kalman Estimator lqg Compensator",
     },
     "Uncertainty": {
         "uncertainty.sensitivity": "sensitivity Sensitivity",

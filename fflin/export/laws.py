@@ -16,11 +16,11 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
-from fflin.control.gain_schedule import GainSchedule
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation, Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
+from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import Signals, require_same, sensed
@@ -203,11 +203,6 @@ def _state_cases(
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     """Linearise a robot at the point and reference stored with a gain that was read from a file."""
-    if not gain.placement.size:
-        raise InputError(
-            "the file of the gain does not contain the reference pose, because the file was "
-            "written by an older version; design the gain again"
-        )
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "

@@ -207,12 +207,12 @@ def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
     """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
-    motion, schedule, gains = policy.trajectory, policy.schedule, policy.schedule.interpolant
+    motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    pieces = schedule.K if schedule.dt else gains.pieces
-    pieces = pieces.reshape(len(gains.starts), -1, len(u[0]) * state.nx)
+    pieces = schedule.K if schedule.dt else schedule.pieces
+    pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
     if ends:
         last = np.zeros_like(pieces[:1])
         last[0, 0] = policy.end_gain.ravel()
@@ -233,8 +233,8 @@ def _path(
         ends=bool(ends),
         held=held,
         over=policy.over,
-        last=gains.last - gains.first,
-        starts=gains.starts,
+        last=float(schedule.t[-1] - schedule.t[0]),
+        starts=schedule.starts,
         K=pieces.ravel(),
         order=pieces.shape[1],
     )
