@@ -24,7 +24,7 @@ from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.files import given
-from fflin.linear.model import LinearModel, same_certificate
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 
@@ -379,7 +379,6 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Add the certificate of a whole model to its part, and a source to a sampled part."""
-    fingerprint, source = part.fingerprint, lin.generator
-    certify = partial(same_certificate, lin, fingerprint)
-    of = (fingerprint, make(source)) if lin.dt and source is not None else None
-    return replace(part, _certify=certify, _source=of)
+    source = lin.generator
+    whole = lin if not lin.dt or source is None else make(source)
+    return replace(part, _source=(part.fingerprint, whole))

@@ -25,6 +25,9 @@ from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
+# Function of t, q and v that returns the inputs u* of a reference, and the error e from it.
+Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
+
 
 @runtime_checkable
 class Gridded(Protocol):
@@ -47,6 +50,13 @@ class Feedback:
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
+
+    def deviation(self, robot: Robot) -> Deviation:
+        """Return f(t, q, v) -> u*, e: the inputs of the reference, and the error from it."""
+        lin, state = self.lin, self.state_map(robot)
+        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
+        near[fed] = lin.x0
+        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
 
 
 @dataclass(eq=False)
