@@ -437,8 +437,8 @@ def _tested(
         e = rng.normal(size=(len(roots), len(P))) @ W.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
-        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
-        return completed(job, starts - job.x0, how)["outcome"]
+        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
+        return completed(job, lambda a, b: starts[a:b], len(e), how)["outcome"]
 
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
     reach = [
