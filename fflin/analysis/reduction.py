@@ -329,17 +329,13 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = floating_inertia(lin.M, kept, removed)
-    return selected(_balanced(lin), names, rest, partial(without, removed=removed))
-
-
-def _balanced(lin: LinearModel) -> LinearModel:
-    """Set stiffness and damping of a model to zero if they are only rounding errors of a spin."""
+    # Set stiffness and damping to zero if they are only rounding errors of a spin.
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
     if not lin.dt and not system.D.values.any():
         A[nv:, nv:] = 0.0
-    return replace(lin, A=A)
+    return selected(replace(lin, A=A), names, rest, partial(without, removed=removed))
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
