@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
-from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -57,15 +56,15 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
     return array
 
 
-def number(name: str, value: object) -> float:
+def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
-    result: float | None = None
-    if isinstance(value, SupportsFloat) and not isinstance(value, bool | np.bool_):
-        with suppress(TypeError, ValueError, OverflowError):
-            result = float(value)
-    if result is None:
+    if isinstance(value, bool | np.bool_ | str):
         raise InputError(f"{name} is {value!r}, expected a number")
+    try:
+        result = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} is {value!r}, expected a number") from None
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result

@@ -35,7 +35,7 @@ from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
-from fflin.simulation.packing import SLOTS, noise_of, packed
+from fflin.simulation.packing import SLOTS, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of
@@ -136,7 +136,7 @@ class CampaignJob:
             return content_digest(completed(self, lambda *_: first, 1, Execution()))
         plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
         found: dict[str, object] = {**self._in_lanes(first), "target": self.target}
-        if noise_of(plan):
+        if plan.noise:
             last = min(plan.times.steps, SLOTS * plan.times.sample)
             found["of sensors"] = noises(plan, len(loop.law.y), 0, last)[1]
         left: list[object] = [loop]

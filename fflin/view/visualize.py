@@ -187,13 +187,13 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        from fflin.view.mode_page import mode_page
+        from fflin.view.pages import mode_page
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
     else:
         robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-        from fflin.view.motion_page import motion_page
+        from fflin.view.pages import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
         page, notes = motion_page(
