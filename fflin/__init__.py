@@ -1,7 +1,6 @@
 """Linear models of free-floating robots from URDF, for analysis, control and simulation."""
 
 from importlib import import_module
-from typing import Any
 
 from fflin.base import __version__
 
@@ -10,143 +9,110 @@ from fflin.base import __version__
 # lists the same names and modules.
 _PUBLIC = {
     "Robots": {
-        "robot.loading": ["load", "from_model"],
-        "robot.catalog": ["list_robots"],
-        "robot.robot": ["Robot"],
-        "robot.orbit": ["CircularOrbit"],
-        "robot.equipment.appendages": ["FlexibleAppendage", "Slosh"],
-        "dynamics.points": ["configuration", "velocity", "effort"],
-        "dynamics.impact": ["capture", "Capture", "jam", "Impact"],
+        "robot.loading": "load from_model",
+        "robot.catalog": "list_robots",
+        "robot.robot": "Robot",
+        "robot.orbit": "CircularOrbit",
+        "robot.equipment.appendages": "FlexibleAppendage Slosh",
+        "dynamics.points": "configuration velocity effort",
+        "dynamics.impact": "capture Capture jam Impact",
     },
     "Inputs": {
-        "robot.inputs": ["BaseTorque", "BaseForce", "JointTorque", "Thruster", "ReactionWheel"],
-        "robot.robot_files": ["load_inputs"],
+        "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel",
+        "robot.robot_files": "load_inputs",
     },
     "Outputs": {
-        "robot.outputs": [
-            "FullState",
-            "JointPositions",
-            "JointVelocities",
-            "BasePose",
-            "FramePose",
-            "FrameVelocity",
-            "RelativePose",
-            "Gyroscope",
-            "Accelerometer",
-            "CenterOfMass",
-            "Momentum",
-        ],
+        "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "
+        "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum",
     },
     "Linear models": {
-        "linear.linearization": ["linearize", "Linearizer"],
-        "linear.model": ["LinearModel", "Certificate"],
-        "dynamics.state": ["StateMap"],
-        "linear.fit": ["outputs"],
-        "linear.equilibrium": ["equilibrium", "Equilibrium"],
-        "linear.trajectory": ["Trajectory"],
-        "linear.linear_trajectory": ["linearize_trajectory", "LinearTrajectory"],
-        "linear.exchange": ["transform", "from_tool", "ToolModel", "ToolGain"],
-        "linear.check": ["check", "Check"],
+        "linear.linearization": "linearize Linearizer",
+        "linear.model": "LinearModel Certificate",
+        "dynamics.state": "StateMap",
+        "linear.fit": "outputs",
+        "linear.equilibrium": "equilibrium Equilibrium",
+        "linear.trajectory": "Trajectory",
+        "linear.linear_trajectory": "linearize_trajectory LinearTrajectory",
+        "linear.exchange": "transform from_tool ToolModel ToolGain",
+        "linear.check": "check Check",
     },
     "Analysis": {
-        "analysis.controllability": ["controllability", "Controllability"],
-        "analysis.observability": ["observability", "Observability", "gramians", "Gramians"],
-        "analysis.modes": ["modes", "Modes", "Mode"],
-        "analysis.effective_masses": ["effective_masses", "EffectiveMasses"],
-        "analysis.relative_equilibria": [
-            "relative_equilibria",
-            "RelativeEquilibria",
-            "RelativeEquilibrium",
-        ],
-        "analysis.reduction": [
-            "momentum_reduction",
-            "ReducedModel",
-            "generalized_inertia",
-            "generalized_jacobian",
-        ],
+        "analysis.controllability": "controllability Controllability",
+        "analysis.observability": "observability Observability gramians Gramians",
+        "analysis.modes": "modes Modes Mode",
+        "analysis.effective_masses": "effective_masses EffectiveMasses",
+        "analysis.relative_equilibria": "relative_equilibria RelativeEquilibria "
+        "RelativeEquilibrium",
+        "analysis.reduction": "momentum_reduction ReducedModel generalized_inertia "
+        "generalized_jacobian",
     },
     "Control": {
-        "control.lqr": ["lqr", "acceleration_lqr"],
-        "linear.fit": ["line_up"],
-        "control.weights": ["bryson", "sampled_cost"],
-        "control.gain": ["Gain"],
-        "control.plan": ["plan"],
-        "control.mpc": ["mpc"],
-        "control.tvlqr": ["tvlqr", "tvkalman"],
-        "control.gain_schedule": ["GainSchedule", "FilterSchedule"],
-        "control.kalman": ["kalman", "Estimator", "lqg", "Compensator"],
+        "control.lqr": "lqr acceleration_lqr",
+        "linear.fit": "line_up",
+        "control.weights": "bryson sampled_cost",
+        "control.gain": "Gain",
+        "control.plan": "plan",
+        "control.mpc": "mpc",
+        "control.tvlqr": "tvlqr GainSchedule FilterSchedule",
+        "control.kalman": "tvkalman kalman Estimator lqg Compensator",
     },
     "Uncertainty": {
-        "uncertainty.sensitivity": ["sensitivity", "Sensitivity"],
-        "uncertainty.uncertain": ["uncertain", "Uncertain"],
-        "uncertainty.lft": ["LFT"],
+        "uncertainty.sensitivity": "sensitivity Sensitivity",
+        "uncertainty.uncertain": "uncertain Uncertain",
+        "uncertainty.lft": "LFT",
     },
     "Policies": {
-        "control.policies": ["StateFeedback", "Allocation"],
-        "control.tracking": ["TrajectoryFeedback", "TrajectoryOutputFeedback"],
-        "control.linear_controller": ["OutputFeedback", "LinearController"],
-        "batch.gains": ["ScheduledFeedback"],
+        "control.policies": "StateFeedback Allocation",
+        "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
+        "control.linear_controller": "OutputFeedback LinearController",
+        "batch.gains": "ScheduledFeedback",
     },
     "C code": {
-        "export.writing": ["write_c"],
-        "export.claw": ["CLaw"],
+        "export.writing": "write_c",
+        "export.claw": "CLaw",
     },
     "Simulation": {
-        "simulation.simulate": ["simulate"],
-        "simulation.motion": ["Motion"],
-        "view.visualize": ["visualize"],
+        "simulation.simulate": "simulate",
+        "simulation.motion": "Motion",
+        "view.visualize": "visualize",
     },
     "Campaigns": {
-        "campaign.monte_carlo": ["monte_carlo"],
-        "campaign.campaign": ["Campaign"],
-        "campaign.spreads": ["load_dispersions"],
-        "campaign.funnel": ["funnel", "Funnel"],
-        "campaign.validity": ["validity", "Validity"],
+        "campaign.monte_carlo": "monte_carlo",
+        "campaign.campaign": "Campaign",
+        "campaign.spreads": "load_dispersions",
+        "campaign.funnel": "funnel Funnel",
+        "campaign.validity": "validity Validity",
     },
     "Sweeps": {
-        "batch.sweep": ["sweep"],
-        "batch.linear_batch": ["LinearBatch"],
-        "batch.gains": ["lqr_batch", "GainBatch"],
-        "batch.configurations": ["grid", "Grid", "random_configurations", "RandomConfigurations"],
+        "batch.sweep": "sweep",
+        "batch.linear_batch": "LinearBatch",
+        "batch.gains": "lqr_batch GainBatch",
+        "batch.configurations": "grid Grid random_configurations RandomConfigurations",
     },
     "Figures": {
-        "analysis.plots": ["plot_matrices", "plot_check", "plot_modes"],
-        "campaign.plots": ["plot_validity", "plot_funnel", "plot_campaign"],
-        "control.plots": ["plot_poles", "plot_loops"],
-        "simulation.motion": ["plot_motion"],
+        "analysis.plots": "plot_matrices plot_check plot_modes",
+        "campaign.plots": "plot_validity plot_funnel plot_campaign",
+        "control.plots": "plot_poles plot_loops",
+        "simulation.motion": "plot_motion",
     },
     "Errors": {
-        "base.errors": [
-            "FflinError",
-            "InputError",
-            "UnknownNameError",
-            "FileError",
-            "MissingPackageError",
-            "ModelError",
-            "UrdfError",
-            "ChartError",
-            "EquilibriumError",
-            "SingularInertiaError",
-            "StabilizabilityError",
-            "DetectabilityError",
-            "SweepError",
-            "FflinWarning",
-        ],
+        "base.errors": "FflinError InputError UnknownNameError FileError MissingPackageError "
+        "ModelError UrdfError ChartError EquilibriumError SingularInertiaError "
+        "StabilizabilityError DetectabilityError SweepError FflinWarning",
     },
 }
 
-
 _MODULES: dict[str, str] = {}
 for _title, _modules in _PUBLIC.items():
-    _names = [name for names in _modules.values() for name in names]
+    _names = " ".join(_modules.values()).split()
     _rows = [", ".join(_names[at : at + 4]) for at in range(0, len(_names), 4)]
     __doc__ = "\n    ".join((f"{__doc__}\n\n{_title}", *_rows))
-    _MODULES |= {name: module for module, names in _modules.items() for name in names}
+    _MODULES |= {name: module for module, names in _modules.items() for name in names.split()}
 
 __all__ = sorted(_MODULES)  # noqa: PLE0605
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module 'fflin' has no attribute '{name}'")
     value = getattr(import_module(f"fflin.{_MODULES[name]}"), name)

@@ -88,9 +88,9 @@ from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
 from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
-from fflin.control.gain_schedule import GainSchedule as GainSchedule
-from fflin.control.tvlqr import tvkalman as tvkalman
-from fflin.control.gain_schedule import FilterSchedule as FilterSchedule
+from fflin.control.tvlqr import GainSchedule as GainSchedule
+from fflin.control.kalman import tvkalman as tvkalman
+from fflin.control.tvlqr import FilterSchedule as FilterSchedule
 from fflin.control.kalman import kalman as kalman
 from fflin.control.kalman import Estimator as Estimator
 from fflin.control.kalman import lqg as lqg

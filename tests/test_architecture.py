@@ -39,6 +39,8 @@ def test_the_stub_has_the_names_and_modules_of_the_package():
     assert names == set(fflin.__all__)
     modules = {alias.name: node.module for node in imports for alias in node.names}
     assert modules == {name: f"fflin.{module}" for name, module in fflin._MODULES.items()}
+    for name, module in modules.items():
+        assert getattr(fflin, name).__module__ == module
 
 
 def test_the_package_and_its_citation_have_the_same_version():

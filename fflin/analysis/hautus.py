@@ -186,7 +186,14 @@ def unobservable(
     # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
     # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.
     # By symmetry, the uncontrollable motions are the unobservable motions of C_s = S^T, C_v = 0.
-    if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
+    if not system.symmetric:
+        return None
+    starts, margin = system.poles
+    # Sampling may map two poles to one, or a vibration to the pole z = 1.
+    s = np.concatenate((starts, np.conj(starts), [0.0])) * dt
+    apart = s[:, None] - s
+    turns = np.round(apart.imag / (2.0 * np.pi))
+    if ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any():
         return None
     none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
@@ -194,7 +201,6 @@ def unobservable(
     unit = slow / fast if fast and slow else 1.0
     scale = np.concatenate((1.0 / system.size, unit / system.size))
     basis, at_origin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
-    starts, margin = system.poles
     margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
     at_zero = basis * scale[:, None]
     motions, poles = [at_zero], [0j] * at_zero.shape[1]
@@ -280,11 +286,3 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
     if not system.D.values.any():
         return complex(0.0, refined.imag)
     return refined
-
-
-def _aliased(poles: Values, dt: float) -> bool:
-    """Return whether sampling maps two poles to one, or a vibration to the pole z = 1."""
-    s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
-    apart = s[:, None] - s
-    turns = np.round(apart.imag / (2.0 * np.pi))
-    return ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()

@@ -6,7 +6,7 @@ import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
+from fflin.analysis.ranks import EPS, Margin, Noisy, echelon, without_rounding
 from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, Values, instance, positive
@@ -109,8 +109,24 @@ def observability(lin: LinearModel) -> Observability:
     (6, False)
     """
     lin = mechanics.checked(lin)
-    motions, fixed, method = _unobservable(lin)
-    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    size, nv = np.tile(np.sqrt(lin.M.diagonal()), 2), len(lin.M)
+    source, found = mechanics.at_rest(lin), None
+    if source is not None:
+        system = mechanics.second_order(source)
+        N = mechanics.rates_of_positions(mechanics.rate_matrix(source))
+        C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
+        each = np.linalg.norm(C / size, axis=1)
+        units = np.where(each > 0.0, each, 1.0)
+        shown = without_rounding(Noisy(C, 4.0 * EPS * np.abs(C)), units, size)
+        position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
+        found = unobservable(system, position, velocity, lin.dt)
+    if source is not None and found is not None:
+        motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+        fixed, method = found.fixed, "eigenvalues" if system.acting else "closed form"
+    else:
+        # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
+        part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
+        motions, fixed, method = part.outside, part.fixed, "eigenvalues"
     basis, _ = echelon(motions, size)
     nx, count = basis.shape
     complement = np.linalg.qr(basis * size[:, None], mode="complete")[0][:, count:]
@@ -128,27 +144,6 @@ def observability(lin: LinearModel) -> Observability:
         notes=mechanics.undecided(lin, fixed, "observable", nx - count, "detectable"),
         robot=lin.robot,
     )
-
-
-def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
-    """Return the unobservable motions (nx, k), their poles, and the method."""
-    source, nv = mechanics.at_rest(lin), len(lin.M)
-    if source is not None:
-        system = mechanics.second_order(source)
-        N = mechanics.rates_of_positions(mechanics.rate_matrix(source))
-        C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
-        size = np.tile(system.size, 2)
-        each = np.linalg.norm(C / size, axis=1)
-        units = np.where(each > 0.0, each, 1.0)
-        shown = without_rounding(Noisy(C, 4.0 * EPS * np.abs(C)), units, size)
-        position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
-        found = unobservable(system, position, velocity, lin.dt)
-        if found is not None:
-            motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
-            return motions, found.fixed, "eigenvalues" if system.acting else "closed form"
-    # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
-    part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
-    return part.outside, part.fixed, "eigenvalues"
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +220,15 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
-        _require_decay(lin)
+        poles = np.linalg.eigvals(lin.A)
+        size = float(np.abs(poles).max())
+        growth = size - 1.0 if lin.dt else float(poles.real.max())
+        if growth >= -_DECAY * (1.0 if lin.dt else size):
+            slow = f"of modulus {size:.6g}" if lin.dt else f"at {growth:.3g} 1/s"
+            raise InputError(
+                f"the model is not asymptotically stable (a pole {slow}), so its infinite-time "
+                "Gramians are not finite; give duration= for finite-time Gramians"
+            )
     else:
         duration = positive("duration", duration, "s")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -237,18 +240,6 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         )
     reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, np.inf if duration is None else duration)
-
-
-def _require_decay(lin: LinearModel) -> None:
-    poles = np.linalg.eigvals(lin.A)
-    size = float(np.abs(poles).max())
-    growth = float(np.abs(poles).max()) - 1.0 if lin.dt else float(poles.real.max())
-    if growth >= -_DECAY * (1.0 if lin.dt else size):
-        slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
-        raise InputError(
-            f"the model is not asymptotically stable ({slow}), so its infinite-time Gramians are "
-            "not finite; give duration= for finite-time Gramians"
-        )
 
 
 def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:

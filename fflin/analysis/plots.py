@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.analysis.modes import Mode, Modes
+from fflin.analysis.modes import Modes
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import Values, instance
-from fflin.linear.check import Check, Row
+from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     nx, nu = lin.B.shape
     cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
     size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
-    with drawing(path, *size, layout="compressed") as figure:
+    with drawing(path, *size, compressed=True) as figure:
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
@@ -115,10 +115,19 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
         axes = figure.add_subplot()
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
+        labels = []
         for line, mode in enumerate(modes.modes):
             _draw_shape(axes, line, mode.shape[:half], [colors[unit] for unit in units])
+            growth = "grows" if mode.unstable else "decays"
+            label = f"real, {growth} in {mode.time_constant:.3g} s"
+            if mode.oscillates:
+                label = (
+                    f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
+                    f"damping {mode.damping_ratio:.2g}"
+                )
+            labels.append(label)
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
-        axes.set_yticks(range(count), [_label(mode) for mode in modes.modes], fontsize=8)
+        axes.set_yticks(range(count), labels, fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
@@ -141,15 +150,6 @@ def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> 
     axes.bar(x[late], modulus[late], 0.7, line, fill=False, edgecolor=outline, lw=0.6)
 
 
-def _label(mode: Mode) -> str:
-    if not mode.oscillates:
-        return f"real, {'grows' if mode.unstable else 'decays'} in {mode.time_constant:.3g} s"
-    return (
-        f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
-        f"damping {mode.damping_ratio:.2g}"
-    )
-
-
 def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     """Draw each error of a check together with its tolerance.
 
@@ -169,7 +169,8 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     instance("check", check, Check, "a Check, as fflin.check returns")
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
-    labels = {row: _block_of(row) for row in rows}
+    own = ("ABA derivatives", "differences")
+    labels = {row: row.block if row.test in own else f"{row.test}: {row.block}" for row in rows}
     names = list(dict.fromkeys(labels.values()))
     with drawing(path, 7.5, 2.2 + 0.2 * len(names)) as figure:
         axes = figure.add_subplot()
@@ -190,8 +191,3 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
-
-
-def _block_of(row: Row) -> str:
-    both = ("ABA derivatives", "differences")
-    return row.block if row.test in both else f"{row.test}: {row.block}"

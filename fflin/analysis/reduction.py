@@ -24,7 +24,7 @@ from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.files import given
-from fflin.linear.model import LinearModel, same_certificate
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 
@@ -329,17 +329,13 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = floating_inertia(lin.M, kept, removed)
-    return selected(_balanced(lin), names, rest, partial(without, removed=removed))
-
-
-def _balanced(lin: LinearModel) -> LinearModel:
-    """Set stiffness and damping of a model to zero if they are only rounding errors of a spin."""
+    # Set stiffness and damping to zero if they are only rounding errors of a spin.
     nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
     if not lin.dt and not system.D.values.any():
         A[nv:, nv:] = 0.0
-    return replace(lin, A=A)
+    return selected(replace(lin, A=A), names, rest, partial(without, removed=removed))
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
@@ -383,7 +379,6 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Add the certificate of a whole model to its part, and a source to a sampled part."""
-    fingerprint, source = part.fingerprint, lin.generator
-    certify = partial(same_certificate, lin, fingerprint)
-    of = (fingerprint, make(source)) if lin.dt and source is not None else None
-    return replace(part, _certify=certify, _source=of)
+    source = lin.generator
+    whole = lin if not lin.dt or source is None else make(source)
+    return replace(part, _source=(part.fingerprint, whole))

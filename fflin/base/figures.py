@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from fflin.base.errors import MissingPackageError, optional_package
 from fflin.base.writing import as_path, check_ending, write_atomically
@@ -53,7 +53,7 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 @contextmanager
 def drawing(
-    path: str | Path | None, width: float, height: float, **options: Any
+    path: str | Path | None, width: float, height: float, compressed: bool = False
 ) -> Iterator[Figure]:
     """Yield a figure of a size [in] in fflin's style; save the figure if a path is given."""
     target = None if path is None else as_path(path)
@@ -65,7 +65,7 @@ def drawing(
 
     style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
     with matplotlib.rc_context(style):
-        figure = Figure(**{"figsize": (width, height), "layout": "constrained"} | options)
+        figure = Figure((width, height), layout="compressed" if compressed else "constrained")
         yield figure
         if target is not None:
             content = io.BytesIO()

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
-from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -39,17 +38,12 @@ DOUBLE = np.dtype(np.float64)
 
 def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
-    if type(value) is np.ndarray and value.dtype is DOUBLE:
-        array: Array = value
-    else:
-        array = as_double(name, value)
-    if array.shape != (size,):
-        raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
     # For short vectors, Python's sum is faster than NumPy's and overflows without a warning.
-    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
-        index = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
-    return array
+    if type(value) is np.ndarray and value.dtype is DOUBLE and value.shape == (size,):
+        array: Array = value
+        if math.isfinite(sum(array.tolist())):
+            return array
+    return shaped(name, value, (size,), f": {of_what}")
 
 
 def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> Array:
@@ -57,20 +51,20 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
     array = as_double(name, value)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} has entries that are NaN or infinite, expected finite numbers")
+    for at in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise InputError(f"{name}{at} is {array[tuple(at)]}; every entry must be finite")
     return array
 
 
-def number(name: str, value: object) -> float:
+def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` with the given value."""
     refuse_masked(name, value)
-    result: float | None = None
-    if isinstance(value, SupportsFloat) and not isinstance(value, bool | np.bool_):
-        with suppress(TypeError, ValueError, OverflowError):
-            result = float(value)
-    if result is None:
+    if isinstance(value, bool | np.bool_ | str):
         raise InputError(f"{name} is {value!r}, expected a number")
+    try:
+        result = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} is {value!r}, expected a number") from None
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result

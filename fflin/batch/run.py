@@ -17,16 +17,16 @@ from concurrent.futures import (
     BrokenExecutor,
     Executor,
     Future,
+    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection
 from threading import Lock, Thread, local
 from types import NoneType
-from typing import TYPE_CHECKING, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import ParamSpec, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, 
 from fflin.base.validation import Array, Mask, instance, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
-
-if TYPE_CHECKING:
-    from multiprocessing.process import BaseProcess
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -46,9 +43,6 @@ _QUEUED = 2
 
 # Number of workers assumed if an executor does not report it.
 _UNKNOWN_WORKERS = 16
-
-# Time for a terminated process to end before it is killed [s].
-_PATIENCE = 5.0
 
 Progress: TypeAlias = Callable[[int, int], object]
 
@@ -200,7 +194,9 @@ def _results(
                     running[submit(*span)] = span
                 except Exception as error:  # broken, shut down, or specific to the executor
                     yield span, _reason(error)
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            # Chunks of this process end in order.
+            first = list(running)[:1]
+            for future in first if inside else wait(running, return_when=FIRST_COMPLETED).done:
                 span = running.pop(future)
                 try:
                     result = future.result()
@@ -292,81 +288,60 @@ class OwnWorkers(Executor):
             warnings.warn(said, FflinWarning, stacklevel=4)
             count = cores
         self._max_workers = count
-        # With fork, a process would inherit locks that other threads hold, and could wait for them
-        # forever.
-        self._context = get_context("spawn")
-        self._threads = ThreadPoolExecutor(count)
-        self._mine = local()
+        # Each thread has a pool of one process, so that the others continue if a process dies.
+        self._threads, self._mine = ThreadPoolExecutor(count), local()
         self._lock, self._closed = Lock(), False
-        self._processes: dict[BaseProcess, Connection] = {}
+        self._pools: list[ProcessPoolExecutor] = []
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Call a function in a worker process; raise `WorkerDied` if the process dies."""
-        return self._threads.submit(self._do, fn, args, kwargs)
+        return self._threads.submit(self._do, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        with self._lock:
-            self._closed = True
-            for process in self._processes:
-                process.terminate()
         # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait
         # for a future, the future remains locked. A thread that must set the result of this future
         # would never end.
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for process in list(self._processes):
-            self._end(process)
+        with self._lock:
+            self._closed = True
+        for pool in self._pools:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            pool.shutdown(wait)
 
-    def _do(self, fn: Callable[..., T], args: tuple[object, ...], kwargs: object) -> T:
-        process = getattr(self._mine, "process", None) or self._start()
-        pipe = self._processes[process]
+    def _do(self, task: Callable[[], T]) -> T:
+        pool = getattr(self._mine, "pool", None) or self._start()
         try:
-            pipe.send((fn, args, kwargs))
-            error, result = pipe.recv()
-        except (EOFError, OSError):
-            self._mine.process = None
-            self._end(process)
+            return pool.submit(task).result()
+        except BrokenExecutor:
+            self._mine.pool = None
             raise WorkerDied(
                 "a worker process died, for example because the memory was full"
             ) from None
-        if error is not None:
-            raise error
-        return result
 
-    def _start(self) -> BaseProcess:
+    def _start(self) -> ProcessPoolExecutor:
         """Start a process for this thread and wait until it is ready."""
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
         with self._lock:
             if self._closed:
                 raise NoWorkers("the workers have been shut down")
             try:
                 with _starting():
-                    process.start()
+                    # With fork, a process would inherit locks that other threads hold, and could
+                    # wait for them forever.
+                    pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare)
+                    ready = pool.submit(int)
             except OSError as error:
                 raise NoWorkers(f"no worker process can be started: {error}") from None
-            self._processes[process] = ours
-        theirs.close()
+            self._pools.append(pool)
         try:
-            ours.recv()
-        except (EOFError, OSError):
-            self._end(process)
+            ready.result()
+        except BrokenExecutor:
             raise NoWorkers(
                 'a worker process did not start; make the call under `if __name__ == "__main__":`'
             ) from None
-        self._mine.process = process
-        return process
-
-    def _end(self, process: BaseProcess) -> None:
-        pipe = self._processes.pop(process, None)
-        if pipe is None:  # another thread is already ending it
-            return
-        pipe.close()
-        process.join(_PATIENCE)
-        if process.is_alive():
-            process.kill()
-            process.join()
-        process.close()
+        self._mine.pool = pool
+        return pool
 
 
 # Threads start workers one at a time, because `_starting` changes a module that all threads share.
@@ -401,22 +376,10 @@ def _starting() -> Iterator[None]:
                 masked(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: Connection) -> None:
-    """Run tasks until the parent closes the pipe or ends."""
+def _prepare() -> None:
+    """Let a worker process leave Ctrl-C to its parent process, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_the_caller, daemon=True).start()
-    try:
-        pipe.send(None)
-        while True:
-            function, args, kwargs = pipe.recv()
-            answer: tuple[Exception | None, object]
-            try:
-                answer = None, function(*args, **kwargs)
-            except Exception as error:
-                answer = error, None
-            pipe.send(answer)
-    except (EOFError, OSError):
-        return
 
 
 def _end_with_the_caller() -> None:

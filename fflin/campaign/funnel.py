@@ -32,8 +32,8 @@ from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
-from fflin.control.gain_schedule import GainSchedule
 from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
@@ -367,9 +367,8 @@ def funnel(
     2
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    feedback = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
-    instance("schedule", feedback, TrajectoryFeedback, expected)
+    feedback = instance("schedule", followed(schedule, robot), TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)
@@ -438,8 +437,8 @@ def _tested(
         e = rng.normal(size=(len(roots), len(P))) @ W.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
-        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
-        return completed(job, starts - job.x0, how)["outcome"]
+        starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
+        return completed(job, lambda a, b: starts[a:b], len(e), how)["outcome"]
 
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
     reach = [

@@ -35,7 +35,7 @@ from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
 from fflin.simulation.motion import Motion
-from fflin.simulation.packing import SLOTS, noise_of, packed
+from fflin.simulation.packing import SLOTS, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of
@@ -133,10 +133,10 @@ class CampaignJob:
         hashed. Then the digest contains the outcome of the first run instead.
         """
         if self.engine == "python":
-            return content_digest(completed(self, first, Execution()))
+            return content_digest(completed(self, lambda *_: first, 1, Execution()))
         plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
         found: dict[str, object] = {**self._in_lanes(first), "target": self.target}
-        if noise_of(plan):
+        if plan.noise:
             last = min(plan.times.steps, SLOTS * plan.times.sample)
             found["of sensors"] = noises(plan, len(loop.law.y), 0, last)[1]
         left: list[object] = [loop]
@@ -276,13 +276,17 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
 
 
 def completed(
-    job: CampaignJob, drawn: Array, how: Execution, progress: Progress | None = None
+    job: CampaignJob,
+    drawn: Callable[[int, int], Array],
+    count: int,
+    how: Execution,
+    progress: Progress | None = None,
 ) -> dict[str, Array]:
-    """Run a job with the drawn values (N, k), and return its arrays."""
-    store = MemoryStore(len(drawn), chunk_size(len(drawn), how.count(job), job.lanes), job.shapes)
+    """Run a job and return its arrays; `drawn` returns the values of runs start to stop - 1."""
+    store = MemoryStore(count, chunk_size(count, how.count(job), job.lanes), job.shapes)
 
     def rows(start: int, stop: int) -> dict[str, Array]:
-        return {"drawn": drawn[start:stop]}
+        return {"drawn": drawn(start, stop)}
 
     if failed := run_chunks(job, rows, store, how, progress, all_needed=True):
         raise FflinError(failed[0][2])

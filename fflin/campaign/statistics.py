@@ -210,11 +210,12 @@ class RunStatistics(Statistics):
         first = _by_run(self._marks.states[: self._state.nx])
         return self._over(first, errors_of(self._state, self._target, q, v)[1])
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
-        """Add rows (steps, count, ..) of q, nu, u, .. from step `first` on, also given as `raw`."""
+    def add(self, first: int, rows: Array) -> None:
+        """Add rows (steps, width, LANES) of q, nu, u, .. from step `first` on."""
         take = kernel("loop", "take", "the run statistics")
-        take(self._words, raw, first, len(rows[0]))
-        self._last = [each[-1] for each in rows[:3]]
+        take(self._words, rows.reshape(-1, LANES), first, len(rows))
+        sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
+        self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of the runs after `done` steps; `stop` has indices into STOPS."""

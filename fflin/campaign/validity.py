@@ -13,7 +13,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, number, share, whole
+from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
@@ -234,6 +234,15 @@ def validity(
     confidence = share("confidence", confidence)
     how = Execution(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
+
+    def displaced(levels: Array, streams: Indices, runs: Indices) -> Array:
+        """Return the initial deviations of some runs, each from its own random stream."""
+        x = []
+        for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+            x.append(loop.displaced(rng, **_scaled(largest, level)))
+        return np.array(x) - loop.start
+
     sets, work = [], []
     # Level and random stream of each run: the runs for the prediction error, then the random runs.
     for predicts, at, streams in (
@@ -241,21 +250,18 @@ def validity(
         (False, levels, _DIRECTIONS + np.arange(samples)),
     ):
         runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"], engine)
-        starts = np.empty((len(at), len(loop.start)))
-        for start, level, stream in zip(starts, at.tolist(), streams.tolist(), strict=True):
-            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-            start[:] = loop.displaced(rng, **_scaled(largest, level)) - loop.start
-        sets.append((runs_of, starts))
+        starts = partial(displaced, at, streams)
+        sets.append((runs_of, starts, len(at)))
         # A random run usually settles after 1 / PATIENCE of its longest duration.
         long = len(at) if predicts else math.ceil(len(at) / PATIENCE)
-        work.append((runs_of(), starts[:LANES], long))
-    total, done, found = sum(len(starts) for _, starts in sets), 0, []
+        work.append((runs_of(), starts(np.arange(min(LANES, len(at)))), long))
+    total, done, found = sum(count for *_, count in sets), 0, []
     with how:
         expect(progress, work, how)
-        for runs_of, starts in sets:
+        for runs_of, starts, count in sets:
             told = progress and partial(_report, progress, done, total)
-            found.append(settle(runs_of, starts, how, told))
-            done += len(starts)
+            found.append(settle(runs_of, starts, count, how, told))
+            done += count
     predicted, random = found
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])

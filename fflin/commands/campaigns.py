@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fflin.batch.configurations import Configurations
 
 _ROWS = 240  # rows of errors and inputs in a figure
+_RUNS = ("dt", "knots", "samples", "seed", "confidence", "threads")
 
 
 def montecarlo(arguments: Namespace) -> Report:
@@ -118,13 +119,8 @@ def funnel(arguments: Namespace) -> Report:
             once("--goal", arguments.goal),
             within=once("--within", arguments.within),
             limits=limits_of_options(arguments),
-            dt=arguments.dt,
-            knots=arguments.knots,
-            samples=arguments.samples,
-            seed=arguments.seed,
-            confidence=arguments.confidence,
-            threads=arguments.threads,
             progress=bar,
+            **{name: getattr(arguments, name) for name in _RUNS},
         )
     files = {
         arguments.plot: lambda path: fflin.plot_funnel(found, path),

@@ -13,25 +13,27 @@ from importlib import import_module
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.writing import check_ending, check_output_path, files_of_command
-from fflin.commands import BAD_INPUT, DONE, parser
+from fflin.commands import BAD_INPUT, DONE, options, parser
 from fflin.commands.results import finish, require_own_kind
 
-# {task: {command: module}}, in the order of the help.
+# {task: commands}, in the order of the help.
 TASKS = {
-    "inspect robots": {
-        **{"robots": "models", "info": "models", "init": "models"},
-        **{"view": "simulation"},
-    },
-    "make and check a linear model": {"linearize": "models", "check": "models"},
-    "analyse a model": {
-        **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity"), "analysis"),
-        **{"uncertain": "analysis", "validity": "campaigns", "funnel": "campaigns"},
-    },
-    "design and simulate": {
-        **{"lqr": "regulator", "tvlqr": "regulator", "plan": "simulation"},
-        **{"simulate": "simulation", "export": "regulator"},
-    },
-    "many models or simulations": {"sweep": "campaigns", "montecarlo": "campaigns"},
+    "inspect robots": ("robots", "info", "init", "view"),
+    "make and check a linear model": ("linearize", "check"),
+    "analyse a model": (
+        *("analyze", "modes", "equilibrium", "sensitivity"),
+        *("uncertain", "validity", "funnel"),
+    ),
+    "design and simulate": ("lqr", "tvlqr", "plan", "simulate", "export"),
+    "many models or simulations": ("sweep", "montecarlo"),
+}
+
+# {command: module}; `models` has all other commands.
+_MODULES = {
+    **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity", "uncertain"), "analysis"),
+    **dict.fromkeys(("montecarlo", "validity", "funnel", "sweep"), "campaigns"),
+    **dict.fromkeys(("lqr", "tvlqr", "export"), "regulator"),
+    **dict.fromkeys(("plan", "simulate", "view"), "simulation"),
 }
 
 
@@ -59,17 +61,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             near = get_close_matches(unknown[0], chosen._option_string_actions, n=1, cutoff=0.75)
             hint = f"; did you mean {near[0]}?" if near else ""
             chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        parser.settle_former_names(arguments)
         inputs, outputs = parser.files_of(arguments)
         with files_of_command(inputs, [path for path, _ in outputs]):
             # An output file that cannot be written is an error before any computation.
             for path, kind in outputs:
                 check_output_path(path)  # first, because it reports an output that is also an input
                 check_ending(path, kind.endings)
+                if kind.kinds and not arguments.force:
+                    require_own_kind(path, kind.kinds)
             if getattr(arguments, "plot", None):
                 from fflin.base.figures import require_matplotlib
 
                 require_matplotlib()
-            require_own_kind(arguments)
             code = finish(arguments.run(arguments), arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -103,10 +107,9 @@ def _parser(asked: str) -> parser.Command:
     known = any(asked in names for names in TASKS.values())
     for task, names in TASKS.items():
         group = main.add_argument_group(task)
-        for name, module in names.items():
-            if asked == name or not known:
-                made = import_module(f"fflin.commands.{module}")
-                parser.add_command(commands, getattr(made, name))
+        for name in names if not known else {asked} & {*names}:
+            module = import_module(f"fflin.commands.{_MODULES.get(name, 'models')}")
+            options.add_command(commands, getattr(module, name))
         # argparse puts all commands in one group; move them to the group of their task.
         group._group_actions += commands._choices_actions
         commands._choices_actions = []

@@ -96,7 +96,7 @@ def init(arguments: Namespace) -> Report:
     from fflin.robot.catalog import find_robot
     from fflin.robot.summary import draft
 
-    found = find_robot(arguments.urdf)
+    found = find_robot(arguments.robot)
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
@@ -110,7 +110,7 @@ def init(arguments: Namespace) -> Report:
         urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        robot = fflin.load(arguments.urdf)
+        robot = fflin.load(arguments.robot)
     write_atomically({target: draft(robot, urdf).encode()})
     fflin.load(target)  # warns of settings that the file leaves open
     text = (

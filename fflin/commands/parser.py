@@ -1,4 +1,4 @@
-"""Parser of the command line: the options in options.txt, and functions that read their values."""
+"""Parser of the command line, forms of all options, and functions that read their values."""
 
 from __future__ import annotations
 
@@ -8,19 +8,14 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
-from fflin.base.errors import one_line
+from fflin.base.errors import FflinWarning, one_line
 from fflin.commands import BAD_INPUT
-
-if TYPE_CHECKING:
-    from fflin.commands.results import Report
-
-Commands: TypeAlias = "argparse._SubParsersAction[Command]"
 
 
 def number(text: str) -> float:
@@ -48,13 +43,6 @@ def count_of(text: str) -> int:
     return count
 
 
-def attitude_number(text: str) -> int:
-    """Read the number of a relative equilibrium, 1 to 24."""
-    if (count := count_of(text)) > 24:
-        raise argparse.ArgumentTypeError(f"{count} is too large, expected 1 to 24")
-    return count
-
-
 def input_file(text: str) -> Path:
     """Read the path of an input file."""
     if not text:
@@ -69,9 +57,13 @@ def input_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class OutputFile:
-    """Reader for the path of an output file, with the allowed endings."""
+    """Reader for the path of an output file, with the allowed endings.
+
+    If `kinds` of results are given, only files that contain one of them are replaced.
+    """
 
     endings: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
 
     def __call__(self, text: str) -> Path:
         """Read the path."""
@@ -145,95 +137,118 @@ def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
     return name, parts
 
 
-# {word for the value in options.txt: function that reads it}; all other values are texts.
-READERS: dict[str, Callable[[str], object]] = {
-    **dict.fromkeys(("FPS", "H", "P", "R", "SPEED", "T", "X", "Y", "Z"), number),
-    **dict.fromkeys(("K", "PORT", "S"), whole),
-    **dict.fromkeys(("FILE", "DISPERSIONS"), input_file),
-    **dict.fromkeys(("FILE.toml", "ROBOT", "URDF"), input_name),
-    **dict.fromkeys(("NAME=VALUE", "NAME=W"), assignment),
-    "N": count_of,
-    "[N]": attitude_number,
-    "NAME=RANGE": parameter_range,
-    "NAME[=VALUE]": lock,
-    "[NAME=]VALUE": joint_or_all,
-    "ALTITUDE[:BODY]": orbit,
-    "JOINT=LO:HI:N": grid_axis,
-    "JOINT=LO:HI": joint_range,
+Form: TypeAlias = Mapping[str, Any]  # keywords of `argparse.ArgumentParser.add_argument`
+
+
+def one(
+    reader: Callable[[str], object],
+    metavar: str | tuple[str, ...],
+    default: float | str | None = None,
+    **more: object,
+) -> Form:
+    """Return the form of an option with one value, or with one value for each of several names."""
+    size = {"nargs": len(metavar)} if isinstance(metavar, tuple) else {}
+    return {"type": reader, "metavar": metavar, "default": default, **size, **more}
+
+
+def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
+    """Return the form of an option that may be repeated."""
+    return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
+
+
+_PAIRS = many(assignment, "NAME=VALUE")
+_WEIGHTS = many(assignment, "NAME=W")
+_OF_JOINT = many(joint_or_all, "[NAME=]VALUE")
+_NAMES = many(str, "NAME")
+_ANGLES, _AXES = one(number, ("R", "P", "Y")), one(number, ("X", "Y", "Z"))
+_TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
+_YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
+_FIGURE = OutputFile((".png", ".pdf", ".svg"))
+
+# {option or ARGUMENT: form of its value}; all other options are switches.
+FORMS: dict[str, Form] = {
+    **{"ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"}},
+    **{"URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"}},
+    **{"FILE": {"dest": "file", "type": input_file, "metavar": "FILE"}},
+    "DISPERSIONS": {"dest": "dispersions", "type": input_file, "metavar": "DISPERSIONS"},
+    **dict.fromkeys(("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS),
+    **dict.fromkeys(("effort", "limit", "bryson", "qf", "goal", "within"), _PAIRS),
+    **{"q": _WEIGHTS, "r": _WEIGHTS, "stiffness": _OF_JOINT, "damping": _OF_JOINT},
+    **{"passive": _NAMES, "free-end": _NAMES, "show": _NAMES, "output": many(str, "SPEC")},
+    "lock": many(lock, "NAME[=VALUE]"),
+    "vary": many(parameter_range, "NAME=RANGE", required=True),
+    "grid": many(grid_axis, "JOINT=LO:HI:N"),
+    "range": many(joint_range, "JOINT=LO:HI"),
+    "orbit": one(orbit, "ALTITUDE[:BODY]"),
+    **{"rpy": _ANGLES, "target-rpy": _ANGLES},
+    **{"position": _AXES, "target-position": _AXES, "gravity": _AXES},
+    **{"dt": _TIME, "step": _TIME, "sample": _TIME},
+    **{"duration": one(number, "T"), "delay": one(number, "T", 0.0)},
+    "times": one(number, "T", nargs="+"),
+    **{"attitude": one(number, "X", 90.0), "spread": one(number, "X", 1.0)},
+    "tolerance": one(number, "X"),
+    **{"width": one(number, "P", 0.02), "confidence": one(number, "P", 0.95)},
+    **{"fps": one(number, "FPS", 30.0), "speed": one(number, "SPEED")},
+    **dict.fromkeys(("every", "random", "workers", "threads"), _COUNT),
+    **{"runs": one(count_of, "N", required=True), "samples": one(count_of, "N", 100)},
+    **{"top": one(count_of, "N", 15), "knots": one(count_of, "N", 101)},
+    **{"horizon": one(count_of, "N", 20), "jobs": one(count_of, "N", 1)},
+    "relative-equilibrium": one(count_of, "N", nargs="?", const=1, choices=range(1, 25)),
+    **{"seed": one(whole, "S", 0), "worst": one(whole, "K", 3), "port": one(whole, "N")},
+    **dict.fromkeys(("trajectory", "schedule", "gain", "controller"), _FILE),
+    **{"inputs": one(input_name, "FILE.toml"), "robot": one(input_name, "ROBOT")},
+    **{"only": one(str, "NAME"), "until": one(str, "CONDITION"), "tool": one(str, "FRAME")},
+    **{"method": one(str, "METHOD", "cf4"), "name": one(str, "NAME", "controller")},
+    "output-folder": one(str, "FOLDER", required=True),
+    "frame": {"choices": ("hybrid", "local", "world", "lvlh", "hill")},
+    "reference": {"choices": ("base", "world"), "default": "base"},
+    "hold": {"choices": ("linear", "previous")},
+    "weights": {"choices": ("urdf", "identity")},
+    "limits": {"choices": ("urdf", "none"), "default": "urdf"},
+    "engine": {"choices": ("compiled", "python")},
+    "scene": {"choices": ("space", "lab")},
+    "for": {"choices": ("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates")},
+    "real": {"choices": ("double", "float"), "default": "double"},
+    **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
+    "plot": one(_FIGURE, "FILE"),
+    "html": one(OutputFile((".html",)), "FILE"),
+    "png": one(OutputFile((".png",)), "FILE"),
+    "gif": one(OutputFile((".gif",)), "FILE"),
 }
 
 _REPEATABLE = " (repeatable)"
-
-
-@cache
-def _blocks() -> dict[str, list[tuple[str, str]]]:
-    """Return {block: lines} of options.txt, each with the text of the indented lines below it."""
-    text = Path(__file__).with_name("options.txt").read_text("utf-8")
-    line = re.compile(r"^(\S.*)((?:\n +.*)*)", re.MULTILINE)
-    return {
-        name: [(each[1], " ".join(each[2].split())) for each in line.finditer(lines)]
-        for name, _, lines in (block.partition("]") for block in text.split("\n\n[")[1:])
-    }
+_FORCE = (
+    "replace the file of -o, whatever it contains. Without --force, -o replaces only a file that "
+    "contains a result of the same kind"
+)
 
 
 class Command(argparse.ArgumentParser):
     """Parser of a command that reports errors in one line."""
 
-    common: Sequence[str] = ()
-    required: Sequence[str] = ()
-    kinds: Sequence[str] = ()
-
-    def add_block(self, name: str, title: str = "") -> None:
-        """Add the options of a block; up to its first title, they are in the group `title`."""
-        for line, text in _blocks()[name]:
-            key, _, values = f"{line} {text}".partition(": ")
-            if key == "uses":
-                for each in values.split():
-                    self.add_block(each, title)
-            elif key in ("common", "required", "kinds"):
-                setattr(self, key, values.split())
-            elif line.endswith(":"):
-                title = line[:-1]
-                self._group(title).description = text or None
-            else:
-                self._add_option(line, text, title)
-
-    def _group(self, title: str) -> argparse._ArgumentGroup:
-        groups = {each.title: each for each in self._action_groups}
-        return groups.get(title) or self.add_argument_group(title)
-
-    def _add_option(self, line: str, text: str, title: str) -> None:
-        """Add an option to the group `title`, or an argument of the command."""
-        parts = re.fullmatch(r"((?:-\S+ ?)*)(.*?)( \.\.\.)?(?: = (\S+))?", line)
-        assert parts
-        names, words, default = parts[1].split(), parts[2].split(), parts[4]
-        if not words:
-            action = argparse.BooleanOptionalAction if "[no-]" in line else "store_true"
-            name = names[0].replace("[no-]", "")
-            self._group(title).add_argument(name, help=text, action=action)
-            return
-        word = words[0].removesuffix("...")
-        reader = READERS.get(word, str)
-        more: dict[str, Any] = {"default": default, "metavar": tuple(words) if words[1:] else word}
-        if parts[3]:
-            text += _REPEATABLE
-            more |= {"action": "append", "default": []}
-        elif default and reader is not str:
-            text += f"; {default} by default"
-        if words[1:]:
-            more["nargs"] = len(words)
-        elif word != words[0]:
-            more["nargs"] = "+"
-        elif word == "[N]":
-            more |= {"nargs": "?", "const": 1, "metavar": "N"}
-        elif word.startswith("{"):
-            more |= {"choices": word[1:-1].split(","), "metavar": None}
-        elif word.endswith(")"):
-            more["metavar"], _, endings = word[:-1].partition("(")
-            reader = OutputFile(tuple(endings.split(",")))
-            text = text.replace("FILE", f"FILE: {reader}")
-        place = self._group(title) if names else self
-        place.add_argument(*(names or [word.lower()]), help=text, type=reader, **more)
+    def add(self, title: str, options: Mapping[str, str], forms: Mapping[str, Form]) -> None:
+        """Add a group of options {name: help}; `forms` are the forms of their values."""
+        groups = {"": self, **{each.title: each for each in self._action_groups}}
+        group = groups.get(title) or self.add_argument_group(title)
+        for name, about in options.items():
+            if not name:
+                group.description = about
+                continue
+            text = about
+            form = forms.get(name, {"action": "store_true"})
+            reader, default = form.get("type"), form.get("default")
+            if isinstance(reader, OutputFile):
+                text = text.replace("FILE", f"FILE: {reader}")
+            elif form.get("action") == "append":
+                text += _REPEATABLE
+            elif default is not None and reader in (number, count_of, whole):
+                text += f"; {default:g} by default"
+            flags = [] if name.isupper() else [f"--{name}"]
+            if name.startswith("output-f"):
+                flags.insert(0, "-o")
+            group.add_argument(*flags, help=text, **form)
+            if isinstance(reader, OutputFile) and reader.kinds:
+                group.add_argument("--force", help=_FORCE, action="store_true")
 
     def _print_message(self, message: str, file: object = None) -> None:
         # argparse would ignore errors in writing a help text, so the text is written here.
@@ -256,36 +271,13 @@ def print_error(line: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
-def add_command(commands: Commands, run: Callable[[argparse.Namespace], Report]) -> None:
-    """Add the command that a function with the same name runs, with its options in options.txt.
-
-    The docstring of the function is the help of the command: a summary, and an example at the end.
-    """
-    summary, _, example = (run.__doc__ or "").partition("\n\n")
-    command = commands.add_parser(
-        run.__name__,
-        add_help=False,
-        help=summary[:1].lower() + summary[1:].removesuffix("."),
-        description=summary,
-        epilog=example,
-    )
-    # A negative number such as -1e-3 is a value, not an option.
-    command._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-    about = "show help for the common options; --help all shows help for all options"
-    command.add_argument("-h", "--help", nargs="?", metavar="all", action=_Help, help=about)
-    command.set_defaults(run=run, command=command)
-    command.add_block("every")
-    command.add_block(run.__name__)
-    for action in command._actions:
-        action.required |= action.dest.replace("_", "-") in command.required
-
-
-class _Help(argparse.Action):
+class Help(argparse.Action):
     """Option that prints the short help, or the full help if its value is `all`."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, _: object, value: object, *__: object
     ) -> None:
+        """Print the help, and exit."""
         text = parser.format_help() if value == "all" else short_help(parser)
         parser._print_message(text, sys.stdout)
         parser.exit()
@@ -293,11 +285,10 @@ class _Help(argparse.Action):
 
 def short_help(command: argparse.ArgumentParser) -> str:
     """Return a short help: the first sentence about each common option of a command."""
-    assert isinstance(command, Command)
     arguments = [each for each in command._actions if not each.option_strings]
     every = [each for each in command._actions if each.option_strings]
     options = {each.dest.replace("_", "-"): each for each in every[1:]}
-    common = [*command.common, "json"] if command.common else options
+    common = [*common, "json"] if (common := command.get_default("common")) else [*options]
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
     required = [f"{each.option_strings[-1]} {each.metavar}" for each in every if each.required]
     operands = " ".join([*(str(each.metavar) for each in arguments), *required])
@@ -330,3 +321,20 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[tuple[Path
         elif value is not None and action.type in (input_file, input_name):
             inputs.append(Path(value))
     return inputs, outputs
+
+
+def settle_former_names(arguments: argparse.Namespace) -> None:
+    """Set the time options that are given under their former names, with a warning."""
+    step, sample = (getattr(arguments, name, None) for name in ("step", "former_dt"))
+    if step is not None:
+        said = "the integration step --step has the new name --dt"
+        if arguments.dt is not None:
+            said += ", and the sample time --dt has the new name --sample"
+            arguments.sample = arguments.dt
+        arguments.dt = step
+    elif sample is not None:
+        said = f"--dt has the new name --sample; write --sample {sample:g}"
+        arguments.sample = sample
+    else:
+        return
+    warnings.warn(said, FflinWarning, stacklevel=2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 
@@ -136,11 +136,8 @@ def _fields(value: object) -> object:
     return value._asdict() if hasattr(value, "_asdict") else value
 
 
-def require_own_kind(arguments: argparse.Namespace) -> None:
+def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
     """Raise `FileError` if -o would replace a file of another kind."""
-    path, kinds = getattr(arguments, "output_file", None), arguments.command.kinds
-    if path is None or not kinds or arguments.force:
-        return
     if path.suffix == ".csv" and "LinearModel" in kinds:
         from fflin.linear.files import foreign_table
 

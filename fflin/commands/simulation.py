@@ -276,11 +276,12 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
 
     If the operating point is at its own reference, the target pose of the base is the reference.
     """
+    from fflin.dynamics.coordinates import frame_of
     from fflin.dynamics.state import Actuation
     from fflin.linear.fit import require_same
 
     made = f"{arguments.gain} was made for '{gain.robot}'"
-    frame: Any = gain.frame
+    frame = frame_of(robot, gain.frame)
     state, reference = fflin.StateMap(robot, frame=frame), None
     for kind, there in (("state", state), ("input", Actuation(state))):
         own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")

@@ -73,8 +73,7 @@ class Gain(Design):
         Names of the states that are fed back; empty if all states are fed back. The entries of K,
         P, Q and N are zero for states that are not fed back.
     placement : ndarray (7,)
-        Pose of the model's reference: position [m] and quaternion x, y, z, w. The array is empty if
-        the gain was loaded from a file of an older version, which lacks the pose.
+        Pose of the model's reference: position [m] and quaternion x, y, z, w.
     urdf_sha256 : str
         SHA-256 of the URDF of the robot that the gain was designed for, see `Robot`.
 
@@ -111,10 +110,10 @@ class Gain(Design):
     input_units: tuple[str, ...]
     frame: str
     robot: str
-    weights: str = field(default_factory=str)
-    regulated: tuple[str, ...] = field(default_factory=tuple)
-    placement: Array = field(default_factory=lambda: np.zeros(0))
-    urdf_sha256: str = field(default_factory=str)
+    weights: str
+    regulated: tuple[str, ...]
+    placement: Array
+    urdf_sha256: str
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 

@@ -1,24 +1,30 @@
-"""Steady-state Kalman filter of a linear model, and the LQG compensator."""
+"""Kalman filters about a point and along a trajectory, and the LQG compensator."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
+from fflin.base.process import in_one_thread
 from fflin.base.record import Design
-from fflin.base.validation import Array, Values, dimension, instance
+from fflin.base.validation import Array, Values, dimension, instance, number
 from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
+from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
+from fflin.control.tvlqr import FilterSchedule, asks_steady, require_continuous, steady_end
 from fflin.control.weights import Weight, columns, weight
-from fflin.linear.linear_trajectory import LinearTrajectory
+from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
+from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
@@ -94,7 +100,7 @@ class Estimator(Design):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     robot: str
-    estimated: tuple[str, ...] = field(default_factory=tuple)
+    estimated: tuple[str, ...]
 
     def __repr__(self) -> str:
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
@@ -271,7 +277,6 @@ def kalman(
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,
-        verified=lin.verified,
     )
 
 
@@ -331,6 +336,132 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
         output_names=e.input_names,
         verified=gain.verified and e.verified,
     )
+
+
+@in_one_thread
+def tvkalman(
+    traj: LinearTrajectory,
+    W: Weight,
+    V: Weight,
+    G: ArrayLike | None = None,
+    P0: Weight | str = "steady",
+    *,
+    sample: float,
+) -> FilterSchedule:
+    r"""Return the time-varying Kalman filter of sampled outputs along a trajectory.
+
+    White noise of intensity W acts on the error, and noise of covariance V on the outputs at each
+    sample. Between samples, :math:`\delta u` is held. The covariance P of the estimation error is
+    computed forward from P0 by (10.4) of docs/derivation.md:
+
+    .. math:: P_{k+1} = \Phi (P - P C^T (C P C^T + V)^{-1} C P)_k \Phi^T + W_k,\qquad
+              L = \Phi P C^T (C P C^T + V)^{-1}.
+
+    Here :math:`\Phi` is the transition matrix over one sample, and :math:`W_k` is the covariance of
+    the disturbance integrated over this sample.
+
+    Parameters
+    ----------
+    traj : LinearTrajectory
+        Trajectory of a robot whose outputs are the measurements.
+    W : array_like (nx, nx) or (nx,), float, or mapping
+        Intensity of the disturbance, positive semidefinite, as in `kalman`.
+    V : array_like (ny, ny) or (ny,), float, or mapping
+        Covariance of the measurement noise at a sample, positive definite.
+    G : array_like (nx, nw) or (N, nx, nw), optional
+        Input matrix of the disturbance, interpolated linearly between the knots; W is then (nw,
+        nw). With ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are
+        names of inputs.
+    P0 : "steady", or as W
+        Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
+        start point is the first configuration, in its initial motion if this motion is steady,
+        otherwise at rest.
+    sample : float
+        Sampling time [s], which must divide the duration.
+
+    Returns
+    -------
+    FilterSchedule
+
+    Raises
+    ------
+    InputError
+        If a size or value is wrong, if P overflows, or if the sampling time does not divide the
+        duration.
+    UnknownNameError
+        If a name does not exist.
+    EquilibriumError, DetectabilityError
+        If P0 is "steady", and either no inputs can hold the robot at the start point or the model
+        at this point is not detectable.
+
+    References
+    ----------
+    R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
+    >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
+    (21, 18, 18)
+    """
+    require_continuous(traj)
+    dt = number("sample", sample)
+    V = weight("V", V, traj.output_names, definite=True)
+    noise, columns = disturbance(traj, W, G)
+    columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
+
+    def intensity(t: float) -> Array:
+        (by,) = traj.between(t, columns)
+        spread = by @ noise @ by.T
+        return 0.5 * (spread + spread.T)
+
+    if asks_steady(P0, "P0", "a covariance"):
+        lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
+        try:
+            P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
+        except (DetectabilityError, InputError) as error:
+            said = f"no steady filter exists at the start of the trajectory: {error}; or give P0"
+            raise type(error)(said) from None
+    else:
+        P = weight("P0", P0, traj.state_names)
+    held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
+    maps = np.array([whole for _, whole in held])
+    with riccati.bounded_by("a smaller W or a larger V"):
+        disturbed = [_disturbed(steps, intensity) for steps, _ in held]
+        stages = [
+            (block_diag(each, V), np.hstack((whole[:, :nx].T, C.T)))
+            for each, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
+        ]
+        K, P, residual = riccati.samples_back(stages, P)
+    L = K.transpose(0, 2, 1)
+    return FilterSchedule._of(
+        at_samples,
+        L=np.concatenate((L, L[-1:])),
+        P=P,
+        A=maps[:, :, :nx],
+        B=maps[:, :, nx:],
+        W=np.array(disturbed),
+        V=V,
+        residual=residual,
+        robot=traj.robot.name,
+        dt=dt,
+        verified=traj.verified,
+    )
+
+
+def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:
+    """Return the covariance (nx, nx) that a disturbance adds during a sample."""
+    nx = len(steps.maps[0])
+    first, second = (np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist())
+    added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * first + LIGHT * second, steps.h)
+    W = np.zeros((nx, nx))
+    for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
+        W = step @ W @ step.T + each
+    return W
 
 
 def disturbance(

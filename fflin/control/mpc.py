@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.base.errors import InputError, listed
+from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Indices, instance, number, whole
+from fflin.base.validation import Array, Indices, Mask, instance, number, vector, whole
 from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
-from fflin.control.horizon import Horizon, Matrices, Receding, Stage
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Feedback, Policy, StateFeedback
+from fflin.control.policies import Clock, Deviation, Feedback, Policy, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
 from fflin.control.weights import Weight, sampled_cost, weight
@@ -28,11 +29,21 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
 
-# Weights Q and R, and the name of their rule.
-Cost: TypeAlias = "tuple[Weight | None, Weight | None, str | None]"
-
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
-_MOST = 20_000_000
+_MOST_ENTRIES = 20_000_000
+
+# Settings of DAQP for rows scaled to length 1, relative to the typical width of the limits. _EXACT
+# is the tolerance. _PRICE is the weight and _YIELDS the regularisation of soft limits. _VIOLATED is
+# the smallest violation to report.
+_EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
+
+# If the robot exceeds a limit by less than this fraction of the width between the limits, the
+# violation is not reported.
+_OVER = 1e-3
+
+# _OPEN is DAQP's infinity, _SOFT is its code of a soft limit, and _SOFTENED is its exit flag for a
+# plan that exceeds a soft limit. _MOST is the largest number of iterations.
+_OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
 @in_one_thread
@@ -134,34 +145,33 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
-    limited = _limits(source, limits)
-    if samples**2 * (len(limited.at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
+    limited = _signals(source, limits)
+    if samples**2 * (len(limited.at) + len(lin.state_names)) * len(lin.input_names) > _MOST_ENTRIES:
         raise InputError(
             f"horizon is {samples} samples with {len(limited.at)} limits, which makes the "
             "optimisation problem too large; give a shorter horizon or fewer limits"
         )
-    given = (Q, R, weights), Qf, samples, dt, limited
-    made: Callable[[Horizon], Mpc | TrajectoryMpc]
+    of = source.robot if isinstance(source, LinearModel) else source.robot.name
+    ahead = Horizon((), samples, dt, lin.input_names, limited, of)
     if isinstance(source, LinearTrajectory):
-        made, stages = _along(source, *given)
-    else:
-        made, stages = _about(source, *given)
-    acting = limited.at[limited.at < len(lin.input_names)]
-    of: Any = getattr(source.robot, "name", source.robot)
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, limited.names, of))
+        return _along(source, ahead, Q, R, Qf, weights)
+    return _about(source, ahead, Q, R, Qf, weights)
 
 
-class _Shown:
+class _Predictive:
     horizon: Horizon
+    deviation: Callable[[Robot], Deviation]
 
     def __repr__(self) -> str:
-        of = self.horizon
-        said = f"'{of.robot}', {of.samples} samples of {of.dt:g} s, {len(of.limited)} limits"
-        return f"{type(self).__name__}({said})"
+        return f"{type(self).__name__}({self.horizon!r})"
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot with the same states and inputs."""
+        return Receding(self.horizon, self.deviation(robot))
 
 
 @dataclass(eq=False, repr=False)
-class Mpc(_Shown, Feedback):
+class Mpc(_Predictive, Feedback):
     """Model predictive controller about a point.
 
     Attributes
@@ -182,20 +192,9 @@ class Mpc(_Shown, Feedback):
         """Return the quadratic program at the deviation e = x - x0 (nx,), by default zero."""
         return self.horizon.matrices(e, 0.0)
 
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot with the model's states and inputs."""
-        lin, state = self.lin, self.state_map(robot)
-        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
-        near[fed] = lin.x0
-
-        def at(_: float, q: Array, v: Array) -> tuple[Array, Array]:
-            return lin.u0, state.read(q, v, near=near)[fed] - lin.x0
-
-        return Receding(self.horizon, at)
-
 
 @dataclass(eq=False, repr=False)
-class TrajectoryMpc(_Shown, TrajectoryFeedback):
+class TrajectoryMpc(_Predictive, TrajectoryFeedback):
     """Model predictive controller along a trajectory and about its end.
 
     The inherited attributes contain the trajectory and the regulator's schedule.
@@ -207,28 +206,8 @@ class TrajectoryMpc(_Shown, TrajectoryFeedback):
         """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
         return self.horizon.matrices(e, t)
 
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot with the trajectory's states and inputs."""
-        return Receding(self.horizon, self.deviation(robot))
 
-
-class _Limits(NamedTuple):
-    """Limited signals: their names, limits, and indices among inputs, states and outputs."""
-
-    names: tuple[str, ...]
-    at: Indices
-    low: Array
-    high: Array
-
-    def of_stage(self, C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
-        """Return E, D, low and high of a stage from its output matrices and target values."""
-        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)[self.at]
-        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[self.at]
-        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[self.at]
-        return of_e, of_d, self.low - there, self.high - there
-
-
-def _limits(of: LinearModel | LinearTrajectory, limits: object) -> _Limits:
+def _signals(of: LinearModel | LinearTrajectory, limits: object) -> Signals:
     """Return the limits of a model's inputs, states and outputs."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
@@ -254,55 +233,67 @@ def _limits(of: LinearModel | LinearTrajectory, limits: object) -> _Limits:
             f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
         )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
-    return _Limits(tuple(names[i] for i in at), at, low[at], high[at])
+    return Signals(tuple(names[i] for i in at), at, low[at], high[at])
 
 
 def _about(
-    lin: LinearModel, cost: Cost, Qf: Weight | str, samples: int, dt: float, signals: _Limits
-) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
-    """Return a function that creates the controller about a point, and the stages."""
-    (Q, R, weights), sampled = cost, lin.discretize(dt)
-    given = (Q, R) if Q is None or R is None else sampled_cost(lin, dt, Q, R)
+    lin: LinearModel,
+    ahead: Horizon,
+    Q: Weight | None,
+    R: Weight | None,
+    Qf: Weight | str,
+    weights: str | None,
+) -> Mpc:
+    """Return the controller about a point, with the stages of the horizon `ahead`."""
+    sampled, signals = lin.discretize(ahead.dt), ahead.signals
+    given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
     limited = signals.of_stage(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
     far = np.maximum(limited[2], -limited[3]) > 1e-9
-    if beyond := [name for name, out in zip(signals.names, far, strict=True) if out]:
+    if far.any():
         raise InputError(
-            f"the point exceeds the limits of {listed(beyond)}; give wider limits, or linearise "
-            "about another point"
+            f"the point exceeds the limits of {listed(compress(signals.names, far))}; give wider "
+            "limits, or linearise about another point"
         )
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
     whole = np.hstack((sampled.A, sampled.B))
     with bounded_by("a smaller Qf"):
-        K, P, _ = samples_back([(total, whole)] * samples, end)
+        K, P, _ = samples_back([(total, whole)] * ahead.samples, end)
     stages = [_stage(total, whole, *each, limited) for each in zip(K, P[:-1], strict=True)]
-    return lambda ahead: Mpc(sampled, gain, ahead), stages[::-1]
+    return Mpc(sampled, gain, replace(ahead, stages=tuple(stages[::-1])))
 
 
 def _along(
-    traj: LinearTrajectory, cost: Cost, Qf: Weight | str, samples: int, dt: float, signals: _Limits
-) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
-    """Return a function that creates the controller along a trajectory, and the stages."""
-    schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
+    traj: LinearTrajectory,
+    ahead: Horizon,
+    Q: Weight | None,
+    R: Weight | None,
+    Qf: Weight | str,
+    weights: str | None,
+) -> TrajectoryMpc:
+    """Return the controller along a trajectory, with the stages of the horizon `ahead`."""
+    dt, of_stage = ahead.dt, ahead.signals.of_stage
+    schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
-    Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
+    models, end = along(traj.resampled(dt)), follows.end
 
     def about(of: LinearModel, u: Array) -> tuple[Array, ...]:
         # Limits on the base pose apply to its error relative to the trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
-        return signals.of_stage(of.C, of.D, u, x, of.y0)
+        return of_stage(of.C, of.D, u, x, of.y0)
 
     stages = []
-    for k, sample in enumerate(held_stages(traj, dt, Q, R)):
+    for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R)):
         limited = about(models[k + 1], follows.commanded(k * dt)[2])
         stages.append(_stage(*sample, schedule.K[k], schedule.P[k + 1], limited))
-    held, sampled = sampled_cost(end, dt, Q, R), end.discretize(dt)
-    P, K = steady_regulator(end, Q, R, dt)
+    held, sampled = sampled_cost(end, dt, schedule.Q, schedule.R), end.discretize(dt)
+    P, K = steady_regulator(end, schedule.Q, schedule.R, dt)
     total = np.block([[held.Q, held.N], [held.N.T, held.R]])
     last = _stage(total, np.hstack((sampled.A, sampled.B)), K, P, about(end, end.u0))
-    return lambda ahead: TrajectoryMpc(traj, schedule, ahead), stages + [last] * samples
+    stages += [last] * ahead.samples
+    return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))
 
 
 def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array, ...]) -> Stage:
@@ -310,3 +301,267 @@ def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array,
     A, B = np.split(whole, [len(P)], axis=1)
     L = np.linalg.inv(np.linalg.cholesky(total[len(P) :, len(P) :] + B.T @ P @ B)).T
     return Stage(A, B, K, L, *limited)
+
+
+class Signals(NamedTuple):
+    """Limited signals: their names, limits, and indices among inputs, states and outputs."""
+
+    names: tuple[str, ...]
+    at: Indices
+    low: Array
+    high: Array
+
+    def of_stage(self, C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
+        """Return E, D, low and high of a stage from its output matrices and target values."""
+        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)[self.at]
+        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[self.at]
+        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[self.at]
+        return of_e, of_d, self.low - there, self.high - there
+
+
+class Stage(NamedTuple):
+    """Stage e' = A e + B d with d = u - u*, and limits of E e' + D d; input limits come first."""
+
+    A: Array  # (nx, nx)
+    B: Array  # (nx, nu)
+    K: Array  # (nu, nx), gain of the regulator without limits
+    L: Array  # (nu, nu): d = L z - K e costs z'z more than the regulator
+    E: Array  # (m, nx)
+    D: Array  # (m, nu)
+    low: Array  # (m,)
+    high: Array  # (m,)
+
+
+class Matrices(NamedTuple):
+    """Quadratic program over d = u - u* of N samples: min d'H d / 2 + g'd, low <= G d <= high.
+
+    Attributes
+    ----------
+    H, g : ndarray (N nu, N nu), (N nu,)
+        Cost.
+    G, low, high : ndarray (m, N nu), (m,), (m,)
+        Limits.
+    soft : ndarray (m,) of bool
+        Limits that may be exceeded if the program is otherwise infeasible.
+    Phi, Gamma : ndarray (N + 1, nx, nx), (N + 1, nx, N nu)
+        Predicted errors ``e_k = Phi_k e + Gamma_k d``.
+    inputs : tuple of str
+        Names "name[k]" of the entries of d.
+    limits : tuple of str
+        Names of the rows of G; limits of states and outputs apply at the end of sample k.
+    """
+
+    H: Array
+    g: Array
+    G: Array
+    low: Array
+    high: Array
+    soft: Mask
+    Phi: Array
+    Gamma: Array
+    inputs: tuple[str, ...]
+    limits: tuple[str, ...]
+
+
+def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
+    """Return errors, z and limited values as linear functions of e_0 and of z or d.
+
+    The matrices have N nu + nx columns. The first N nu columns multiply z if `planned` is True and
+    d otherwise. The last nx columns multiply e_0.
+    """
+    (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
+    e = np.eye(nx, size + nx, size)
+    states, efforts, limited = [e], [], []
+    for k, by in enumerate(stages):
+        own = np.eye(nu, size + nx, k * nu)
+        d = by.L @ own - by.K @ e if planned else own
+        efforts.append(own if planned else np.linalg.solve(by.L, own + by.K @ e))
+        e = by.A @ e + by.B @ d
+        states.append(e)
+        limited.append(by.E @ e + by.D @ d)
+    return np.array(states), np.vstack(efforts), np.vstack(limited)
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """Samples of a run; near the end of the run, the horizon is the last N samples."""
+
+    stages: tuple[Stage, ...]
+    samples: int  # N
+    dt: float
+    inputs: tuple[str, ...]
+    signals: Signals
+    robot: str
+
+    @property
+    def limited(self) -> tuple[str, ...]:
+        """Names of the limited signals."""
+        return self.signals.names
+
+    @property
+    def acting(self) -> Indices:
+        """Indices of the inputs that have limits."""
+        return self.signals.at[self.signals.at < len(self.inputs)]
+
+    def __repr__(self) -> str:
+        said = f"{self.samples} samples of {self.dt:g} s, {len(self.limited)} limits"
+        return f"'{self.robot}', {said}"
+
+    def window(self, t: float) -> tuple[Stage, ...]:
+        """Return the N samples from time t on."""
+        k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
+        return self.stages[k : k + self.samples]
+
+    def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
+        """Return the lower and upper limits (m,) of stages, and which of these limits are soft."""
+        soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
+        low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
+        return low, high, soft
+
+    def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
+        """Return the quadratic program at time t [s] for the deviation e (nx,) of the state."""
+        stages = self.window(max(number("t", t), 0.0))
+        nx, size = len(stages[0].A), len(self.inputs) * self.samples
+        start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
+        states, z, limited = condensed(stages, planned=False)
+        (low, high, soft), free = self.bounds(stages), limited[:, size:] @ start
+        double = 2.0 * z[:, :size].T
+        H, g = double @ z[:, :size], double @ (z[:, size:] @ start)
+        names = (
+            tuple(f"{name}[{k}]" for k in range(self.samples) for name in of)
+            for of in (self.inputs, self.limited)
+        )
+        program = (H, g, limited[:, :size], low - free, high - free, soft)
+        return Matrices(*program, states[..., size:], states[..., :size], *names)
+
+
+class Receding:
+    """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
+
+    def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
+        self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
+        self._stages: tuple[Stage, ...] = ()
+        self.solves = self.softened = self.unfinished = self.exceeded = 0
+        self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
+        self._due: tuple[Stage, Array] | None = None  # the last sample and its input
+        if horizon.limited:  # now, so that the first sample is not slower
+            self._change(horizon.window(0.0))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the run: plans, exceeded limits and failures of the solver."""
+        said = (
+            f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
+            f"{self.solves}"
+        )
+        if self.softened:
+            said += f"; plans that exceed a soft limit: {self.softened} (worst: {self._said})"
+        if self.exceeded:
+            said += f"; samples at which the robot exceeds a soft limit: {self.exceeded}"
+            said += f" (worst: {self._met})"
+        if self.unfinished:
+            said += (
+                "; plans without a solution, replaced by the saturated LQR command: "
+                f"{self.unfinished}"
+            )
+        return (said,) if self.solves else ()
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command (nu,) at a sample."""
+        self._clock.tick(t)
+        assert self._at is not None
+        u, e = self._at(t, q, v)
+        command: Array = u + self.step(t, e)
+        return command
+
+    def step(self, t: float, e: Array) -> Array:
+        """Return the command (nu,) relative to u* for the error e (nx,)."""
+        stages, acting = self.of.window(t), self.of.acting
+        now, d = stages[0], -stages[0].K @ e
+        if not self.of.limited:
+            return d
+        if not self._stages or stages[0] is not self._stages[0]:
+            self._change(stages)
+        free = self._free @ e
+        self.solves += 1
+        self._judge(t, e)
+        z, flag = self._solved(free)
+        if flag <= 0:  # solve again without a warm start
+            self._start()
+            z, flag = self._solved(free)
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+        if flag == _SOFTENED:
+            self._count(t, free + self._G @ z)
+        if flag <= 0:
+            self.unfinished += 1
+            if self.unfinished == 1:
+                warnings.warn(
+                    f"the MPC optimisation found no solution at t = {t:g} s (DAQP exit flag "
+                    f"{flag}); at such samples, the LQR command is applied instead, saturated at "
+                    "the input limits",
+                    FflinWarning,
+                    2,
+                )
+        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        self._due = now, d
+        return d
+
+    def _judge(self, t: float, e: Array) -> None:
+        """Record soft limits that the robot exceeds because it differs from the model."""
+        first = len(self.of.acting)
+        if self._due is None or first == len(self.of.limited):
+            return
+        by, d = self._due
+        reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
+        excess = np.maximum(low - reached, reached - high)
+        fractions = excess / np.where(np.isfinite(high - low), high - low, 1.0)
+        at = int(fractions.argmax())
+        self.exceeded += bool(fractions[at] > _OVER)
+        if fractions[at] > self._over:
+            self._over = float(fractions[at])
+            self._met = f"{self.of.limited[first + at]} by {excess[at]:.2g} at {t:.4g} s"
+
+    def _count(self, t: float, reached: Array) -> None:
+        """Record by how much a plan exceeds the soft limits."""
+        excess = np.maximum(self._low - reached, reached - self._high) * self._soft
+        row = int((fractions := excess * self._unit).argmax())
+        self.softened += bool(fractions[row] > _VIOLATED * self._size)
+        if fractions[row] > max(self._worst, _VIOLATED * self._size):
+            sample, at = divmod(row, len(self.of.limited))
+            self._worst, when = float(fractions[row]), t + (sample + 1) * self.of.dt
+            self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+
+    def _change(self, stages: tuple[Stage, ...]) -> None:
+        fresh, self._stages = not self._stages, stages
+        rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
+        low, high, self._soft = self.of.bounds(stages)
+        self._G, self._free = rows[:, :size], rows[:, size:]
+        length = np.linalg.norm(self._G, axis=1)
+        moved = length > 1e-12 * length.max()  # drops limits that no input affects
+        self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
+        self._unit = 1.0 / np.where(moved, length, 1.0)
+        width = (self._high - self._low) * self._unit
+        width = width[np.isfinite(width)]
+        self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
+        self._rows = self._G * self._unit[:, None]
+        if fresh:
+            self._start()
+        else:
+            self._model.update(A=self._rows)
+
+    def _start(self) -> None:
+        self._model = optional_package("daqp", "this needs the solver DAQP", "mpc").Model()
+        self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
+        self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
+        (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)
+        open_ = np.full(m, _OPEN)
+        self._model.setup(np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds)
+
+    def _solved(self, free: Array) -> tuple[Array, int]:
+        low, high = (
+            np.clip((limit - free) * self._unit, -_OPEN, _OPEN) for limit in (self._low, self._high)
+        )
+        self._model.update(bupper=high, blower=low)
+        z, _, flag, _ = self._model.solve()
+        return z, int(flag)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -132,7 +132,7 @@ def plan(
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    ends: Any = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
+    ends = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
     x, q, v = (None, *ends) if isinstance(ends, tuple) and len(ends) == 2 else (ends, None, None)
     end = points.point_of(state, x, q, v, lambda: (robot.neutral(), np.zeros(robot.nv)))
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)

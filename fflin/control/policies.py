@@ -25,6 +25,9 @@ from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
+# Function of t, q and v that returns the inputs u* of a reference, and the error e from it.
+Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
+
 
 @runtime_checkable
 class Gridded(Protocol):
@@ -47,6 +50,13 @@ class Feedback:
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
+
+    def deviation(self, robot: Robot) -> Deviation:
+        """Return f(t, q, v) -> u*, e: the inputs of the reference, and the error from it."""
+        lin, state = self.lin, self.state_map(robot)
+        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
+        near[fed] = lin.x0
+        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
 
 
 @dataclass(eq=False)
@@ -141,7 +151,7 @@ class Allocation:
     15
     """
 
-    policy: Any
+    policy: object
     design: Robot
 
     @property
@@ -327,7 +337,7 @@ class Loop(Compensation):
             )
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
-        noise: Any = 0.0
+        noise: Array | float = 0.0
         if self._noise is not None:
             size = len(self.at(t).y0)
             noise = vector("noise(t)", self._noise(t), size, "one value for each output")
@@ -377,8 +387,6 @@ def fed_back(policy: object) -> tuple[str, ...]:
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
-    of: Any = lin if schedule is None else schedule
-    if of is None:
-        return ()
-    used = np.ones(len(of.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(of.state_names, used, strict=True) if size)
+    names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
+    used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(names, used, strict=True) if size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
-from fflin.control.gain_schedule import FilterSchedule, GainSchedule
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Feedback, Loop, Policy, Sample, decider
-from fflin.control.tvlqr import resting_end, steady_regulator
+from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider
+from fflin.control.tvlqr import FilterSchedule, GainSchedule, resting_end, steady_regulator
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, Frame, StateMap
@@ -180,7 +179,7 @@ class TrajectoryFeedback(Feedback):
         require_turns(made, origin.nq, robot)
         return state
 
-    def deviation(self, robot: Robot) -> Callable[..., tuple[Array, Array]]:
+    def deviation(self, robot: Robot) -> Deviation:
         """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
         state = self.state_map(robot)
 
@@ -207,7 +206,7 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: object, robot: Robot, held: float = 0.0) -> Any:
+def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
     """Return the policy to simulate, with commands held for `held` [s].
 
     A gain schedule is replaced by the feedback along its trajectory.

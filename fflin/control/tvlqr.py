@@ -1,32 +1,269 @@
-"""Time-varying linear quadratic regulator and Kalman filter along a trajectory."""
+"""Time-varying regulator along a trajectory, and schedules of gains of regulators and filters."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.reduction import momentum_reduction
-from fflin.base.errors import DetectabilityError, EquilibriumError, InputError, StabilizabilityError
+from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
+from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain
-from fflin.control.gain_schedule import FilterSchedule, GainSchedule, Interpolant
-from fflin.control.kalman import disturbance, kalman
+from fflin.control.gain import Gain, titled
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
-from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
+from fflin.dynamics.integrators import held_cost
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.equilibrium import equilibrium
-from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
+from fflin.linear.fit import require_same
+from fflin.linear.linear_trajectory import LinearTrajectory, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory import Trajectory, cubic
 from fflin.robot.mass_properties import rotor_names
+from fflin.robot.robot import Robot
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Schedule(Design):
+    """Gain as a function of time, given at the knots or samples of a trajectory."""
+
+    t: Array
+    P: Array
+    dt: float
+
+    @cached_property
+    def starts(self) -> list[float]:
+        """Times at which the intervals between knots, or the samples, begin."""
+        # A sample starts slightly before its nominal time, because times are rounded.
+        late = np.append(self.t[0], self.t[1:] - 1e-9 * self.dt)
+        starts: list[float] = (late if self.dt else self.t[:-1]).tolist()
+        return starts
+
+    def interval(self, t: float) -> int:
+        """Return the index of the interval or sample at time t, or raise `InputError`."""
+        t, first, last = number("t", t), self.starts[0], float(self.t[-1])
+        if not first <= t <= last:
+            raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
+        return bisect_right(self.starts, t) - 1
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GainSchedule(Schedule):
+    r"""Time-varying feedback ``u = u*(t) - K(t) e`` of the error e relative to a trajectory.
+
+    Attributes
+    ----------
+    t : ndarray (M,)
+        Times [s] of the knots. A continuous schedule has the knots of the trajectory and further
+        knots for the interpolation of P. The knots of a sampled schedule are the sample times.
+    K : ndarray (M, nu, nx)
+        Gains. In a sampled schedule, the last two gains are equal.
+    P : ndarray (M, nx, nx)
+        Cost matrix: the optimal cost from time t to the end is e' P(t) e.
+    A : ndarray (M, nx, nx)
+    B : ndarray (M, nx, nu)
+        Linear model at the knots. A sampled schedule has M - 1 matrices A and B; each pair
+        describes the transition from one sample to the next.
+    Q, R, Qf : ndarray
+        Weights of the continuous cost.
+    residual : float
+        Largest residual of the differential Riccati equation midway between the knots, relative to
+        the sum of the norms of its terms. A sampled schedule has the residual of the Riccati
+        difference equation instead.
+    state_names, input_names : tuple of str
+    robot : str
+    dt : float
+        Sampling time [s], over which u is held; 0 for continuous time.
+    weights : str
+        Description of the rule that set the weights.
+    knots, q, v, u, hold, frame
+        Data of the trajectory, which `trajectory` returns as a `Trajectory`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> schedule = fflin.tvlqr(along)
+    >>> schedule.gain(0.5).shape, schedule.residual < 1e-3
+    ((9, 18), True)
+    >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
+    """
+
+    VECTORS: ClassVar = ("t", "knots")
+
+    K: Array
+    A: Array
+    B: Array
+    Q: Array
+    R: Array
+    Qf: Array
+    residual: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    robot: str
+    weights: str
+    knots: Array
+    q: Array
+    v: Array
+    u: Array
+    hold: str
+    frame: str
+
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.K.shape[2], nu=self.K.shape[1])
+
+    def __str__(self) -> str:
+        """Return the report: the sizes, the residual and the rule of the weights."""
+        verdict = [] if self.verified else [NOT_VERIFIED]
+        said = [repr(self), f"weights: {self.weights or 'as given'}", *verdict]
+        return "\n".join(folded([each]) for each in said)
+
+    def trajectory(self, robot: Robot) -> Trajectory:
+        """Return the trajectory that the gains were designed for."""
+        state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
+        inputs = Actuation(state).names
+        require_same(made, robot, "state", (self.state_names,) * 2, (state.names,) * 2)
+        require_same(made, robot, "input", (self.input_names,) * 2, (inputs,) * 2)
+        parts = self.knots, self.q, self.v, self.u
+        return Trajectory(robot, *parts, hold=self.hold, frame=self.frame)
+
+    def gain(self, t: float) -> Array:
+        """Return the gain at time t, or raise `InputError` if t is outside the knots.
+
+        Between knots, the gain is computed from the interpolated model and P. A sampled schedule
+        returns the gain of the most recent sample.
+        """
+        k = self.interval(t)
+        if self.dt:
+            return self.K[k]
+        x = t - self.starts[k]
+        square = x * x
+        fourth = square * square
+        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
+
+    def cost_to_go(self, t: float) -> Array:
+        """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
+        k = self.interval(t)
+        if self.dt:
+            return self.P[k]
+        fraction = (t - self.t[k]) / (self.t[k + 1] - self.t[k])
+        P: Array = np.tensordot(fraction ** np.arange(4), self._cubics[k], 1)
+        return P
+
+    @cached_property
+    def _cubics(self) -> Array:
+        """Coefficients (M - 1, 4, nx, nx) of P, for powers of the elapsed fraction."""
+        P, drift, spent = self.P, self.P @ self.A, self.K.mT @ self.R @ self.K
+        rate, h = spent - drift - drift.mT - self.Q, np.diff(self.t)[:, None, None]
+        return cubic(P[:-1], P[1:], h * rate[:-1], h * rate[1:])
+
+    @cached_property
+    def pieces(self) -> Array:
+        """Coefficients (M - 1, 7, nu nx) of K, for powers of the time since the last knot."""
+        from scipy.interpolate import CubicSpline
+
+        # Between knots, P is a cubic and B is a spline, and K = R^-1 B' P.
+        powers = self._cubics / np.diff(self.t)[:, None, None, None] ** np.arange(4)[:, None, None]
+        of_B = CubicSpline(self.t, self.B).c[::-1]
+        pieces = np.zeros((7, *of_B[0].mT.shape))
+        for power, reach in enumerate(np.linalg.solve(self.R, of_B.mT)):
+            pieces[power : power + 4] += reach @ powers.swapaxes(0, 1)
+        return pieces.swapaxes(0, 1).reshape(len(self.t) - 1, 7, -1)
+
+    def defect(self, at: Callable[[Array], riccati.Coefficients]) -> float:
+        """Return the largest relative residual of the differential equation between knots."""
+        h, (first, second, third, fourth) = np.diff(self.t), self._cubics.swapaxes(0, 1)
+        P = first + 0.5 * second + 0.25 * third + 0.125 * fourth
+        rate = (second + third + 0.75 * fourth) / h[:, None, None]
+        A, S, Q = at(self.t[:-1] + 0.5 * h)
+        drift = P @ A
+        return riccati.imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, rate)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FilterSchedule(Schedule):
+    r"""Time-varying Kalman filter for the error e relative to a trajectory.
+
+    Let :math:`y^*(t)` be the outputs along the trajectory, and
+    :math:`\nu = y - y^*(t) - C \hat e - D\,\delta u` the innovation at a sample. The estimate for
+    the next sample is
+
+    .. math:: \hat e^+ = A\,\hat e + B\,\delta u + L\,\nu.
+
+    Attributes
+    ----------
+    t : ndarray (M,)
+        Times [s] of the samples.
+    L : ndarray (M, nx, ny)
+        Filter gains. The last two gains are equal.
+    P : ndarray (M, nx, nx)
+        Covariance of the estimation error before the measurement update.
+    A, B, W : ndarray (M - 1, nx, nx), (M - 1, nx, nu), (M - 1, nx, nx)
+        Transition matrices from one sample to the next, and the covariance of the disturbance
+        over one sample.
+    C, D, y : ndarray (M, ny, nx), (M, ny, nu), (M, ny)
+        Output matrices, and the outputs along the trajectory.
+    V : ndarray (ny, ny)
+        Covariance of the measurement noise at a sample.
+    residual : float
+        Residual of the Riccati difference equation for P, relative to its terms as in
+        `GainSchedule`.
+    state_names, input_names, output_names : tuple of str
+    robot : str
+    dt : float
+        Sampling time [s].
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> filtered = fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
+    >>> filtered.dt, filtered.P.shape[1:]
+    (0.1, (18, 18))
+    """
+
+    VECTORS: ClassVar = ("t",)
+
+    L: Array
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    y: Array
+    W: Array
+    V: Array
+    residual: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    robot: str
+
+    def __repr__(self) -> str:
+        return titled(self, knots=len(self.t), nx=self.L.shape[1], ny=self.L.shape[2])
+
+    def gain(self, t: float) -> Array:
+        """Return L (nx, ny) of the most recent sample at time t."""
+        return self.L[self.interval(t)]
+
+    def covariance(self, t: float) -> Array:
+        """Return P (nx, nx) of the most recent sample at time t."""
+        return self.P[self.interval(t)]
 
 
 @in_one_thread
@@ -111,20 +348,19 @@ def tvlqr(
     require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
     steady = asks_steady(Qf)
-    given, by_rule = list[Any]((Q, R)), Q is None and R is None
-    if not by_rule and (weights is not None or Q is None or R is None):
-        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
-    end: Any = steady_end(traj) if steady or by_rule else None
-    if by_rule:
+    if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        *given, _, rule = rule_weights(end, weights, pace=pace)
-    Q, R, _ = cost_weights(traj, given[0], given[1], None)
-    Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
+        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
+    elif weights is not None or Q is None or R is None:
+        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
+    Q, R, _ = cost_weights(traj, Q, R, None)
+    Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
 
     def at(times: Array) -> riccati.Coefficients:
         A, B = traj.matrices_at(times)
         return riccati.Coefficients(A, riccati.spread(B, R), np.broadcast_to(Q, A.shape))
 
+    residual = 0.0
     with riccati.bounded_by("smaller weights or a larger R"):
         if sample is not None:
             stages = list(held_stages(traj, dt, Q, R))
@@ -135,8 +371,7 @@ def tvlqr(
             t, P = riccati.solve_back(at, traj.t, Qf)
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-            residual = Interpolant(t, P, K, (A, B, Q, R), 0.0).residual(at)
-    return GainSchedule._of(
+    schedule = GainSchedule._of(
         traj,
         t=t,
         K=K,
@@ -152,6 +387,7 @@ def tvlqr(
         weights=rule,
         knots=traj.t,
     )
+    return schedule if dt else replace(schedule, residual=schedule.defect(at))
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
@@ -222,128 +458,3 @@ def steady_regulator(
         part = momentum_reduction(lin)
         gain = regulator(part, part.T.T @ Q @ part.T)
         return part.S.T @ gain.P @ part.S, gain.K @ part.S
-
-
-@in_one_thread
-def tvkalman(
-    traj: LinearTrajectory,
-    W: Weight,
-    V: Weight,
-    G: ArrayLike | None = None,
-    P0: Weight | str = "steady",
-    *,
-    sample: float,
-) -> FilterSchedule:
-    r"""Return the time-varying Kalman filter of sampled outputs along a trajectory.
-
-    White noise of intensity W acts on the error, and noise of covariance V on the outputs at each
-    sample. Between samples, :math:`\delta u` is held. The covariance P of the estimation error is
-    computed forward from P0 by (10.4) of docs/derivation.md:
-
-    .. math:: P_{k+1} = \Phi (P - P C^T (C P C^T + V)^{-1} C P)_k \Phi^T + W_k,\qquad
-              L = \Phi P C^T (C P C^T + V)^{-1}.
-
-    Here :math:`\Phi` is the transition matrix over one sample, and :math:`W_k` is the covariance of
-    the disturbance integrated over this sample.
-
-    Parameters
-    ----------
-    traj : LinearTrajectory
-        Trajectory of a robot whose outputs are the measurements.
-    W : array_like (nx, nx) or (nx,), float, or mapping
-        Intensity of the disturbance, positive semidefinite, as in `kalman`.
-    V : array_like (ny, ny) or (ny,), float, or mapping
-        Covariance of the measurement noise at a sample, positive definite.
-    G : array_like (nx, nw) or (N, nx, nw), optional
-        Input matrix of the disturbance, interpolated linearly between the knots; W is then (nw,
-        nw). With ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are
-        names of inputs.
-    P0 : "steady", or as W
-        Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
-        start point is the first configuration, in its initial motion if this motion is steady,
-        otherwise at rest.
-    sample : float
-        Sampling time [s], which must divide the duration.
-
-    Returns
-    -------
-    FilterSchedule
-
-    Raises
-    ------
-    InputError
-        If a size or value is wrong, if P overflows, or if the sampling time does not divide the
-        duration.
-    UnknownNameError
-        If a name does not exist.
-    EquilibriumError, DetectabilityError
-        If P0 is "steady", and either no inputs can hold the robot at the start point or the model
-        at this point is not detectable.
-
-    References
-    ----------
-    R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
-
-    Examples
-    --------
-    >>> robot = fflin.load("planar_detumble")
-    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
-    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
-    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
-    >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
-    >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
-    (21, 18, 18)
-    """
-    require_continuous(traj)
-    dt = number("sample", sample)
-    V = weight("V", V, traj.output_names, definite=True)
-    noise, columns = disturbance(traj, W, G)
-    columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
-
-    def intensity(t: float) -> Array:
-        (by,) = traj.between(t, columns)
-        spread = by @ noise @ by.T
-        return 0.5 * (spread + spread.T)
-
-    if asks_steady(P0, "P0", "a covariance"):
-        lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
-        try:
-            P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
-        except (DetectabilityError, InputError) as error:
-            said = f"no steady filter exists at the start of the trajectory: {error}; or give P0"
-            raise type(error)(said) from None
-    else:
-        P = weight("P0", P0, traj.state_names)
-    held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
-    maps = np.array([whole for _, whole in held])
-    with riccati.bounded_by("a smaller W or a larger V"):
-        disturbed = [_disturbed(steps, intensity) for steps, _ in held]
-        stages = [
-            (block_diag(each, V), np.hstack((whole[:, :nx].T, C.T)))
-            for each, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
-        ]
-        K, P, residual = riccati.samples_back(stages, P)
-    L = K.transpose(0, 2, 1)
-    return FilterSchedule._of(
-        at_samples,
-        L=np.concatenate((L, L[-1:])),
-        P=P,
-        A=maps[:, :, :nx],
-        B=maps[:, :, nx:],
-        W=np.array(disturbed),
-        V=V,
-        residual=residual,
-        robot=traj.robot.name,
-        dt=dt,
-    )
-
-
-def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:
-    """Return the covariance (nx, nx) that a disturbance adds during a sample."""
-    nx = len(steps.maps[0])
-    first, second = (np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist())
-    added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * first + LIGHT * second, steps.h)
-    W = np.zeros((nx, nx))
-    for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
-        W = step @ W @ step.T + each
-    return W

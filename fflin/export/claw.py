@@ -20,6 +20,7 @@ from fflin.base.record import reading
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, read_file
 from fflin.control.policies import Loop, Policy, Sample
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.export.laws import measured
@@ -104,7 +105,7 @@ class CLaw:
                 "was edited; write them again with fflin.write_c"
             )
         self.dt: float = self._about["dt"]
-        self.frame: Any = self._about["frame"]
+        self.frame: str = self._about["frame"]
         placement = self._about["reference"]
         self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
         if self._about["kind"] == "output" and placement is None:
@@ -133,7 +134,7 @@ class CLaw:
             If the robot and the C code have different states, inputs or outputs.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
-        state = StateMap(robot, reference=self.origin, frame=self.frame)
+        state = StateMap(robot, reference=self.origin, frame=frame_of(robot, self.frame))
         actuation = Actuation(state)
         there = {
             "input": (actuation.names, actuation.units),
@@ -144,10 +145,11 @@ class CLaw:
             require_same(made, robot, kind, (tuple(names), tuple(units)), there[kind])
         require_turns(made, self._about["nq"], robot)
         of_outputs = self._about["kind"] == "output"
-        return _OutputLoop(self, state) if of_outputs else self._state_policy(robot)
+        return _OutputLoop(self, state) if of_outputs else self._state_policy(state)
 
-    def _state_policy(self, robot: Robot) -> Policy:
-        world, n, real = StateMap(robot, frame=self.frame), robot.n, self._real
+    def _state_policy(self, state: StateMap) -> Policy:
+        world, n = StateMap(state.robot, frame=state.frame), state.robot.n
+        real = self._real
         # C has no empty arrays, so an array for joints has at least one entry.
         given, u = (real * (13 + 2 * max(n, 1)))(), (real * len(self._about["u0"]))()
         at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]

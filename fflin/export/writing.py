@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -17,7 +18,8 @@ from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.record import content_digest
 from fflin.base.writing import as_path, write_atomically
-from fflin.export.laws import CASES, OutputLaw, StateLaw, law_of
+from fflin.dynamics.state import StateMap
+from fflin.export.laws import CASES, Law, law_of
 from fflin.robot.robot import Robot
 
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
@@ -102,17 +104,16 @@ def write_c(
     if not isinstance(real, str) or real not in ("double", "float"):
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
     target = as_path(folder)
-    tables = law_of(law, robot, limits)
-    texts = _Texts(tables, name, real)
-    contents = {target / file: text.encode() for file, text in texts.files().items()}
+    title, texts = _texts(law_of(law, robot, limits), name, real)
+    contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
     old = next((path for path in contents if path.exists()), None)
-    title = None
+    there = None
     with suppress(OSError, ValueError, TypeError, LookupError):
-        title = json.loads((target / f"{name}.json").read_bytes())["title"]
-    if old and title != texts.title:
+        there = json.loads((target / f"{name}.json").read_bytes())["title"]
+    if old and there != title:
         raise InputError(
-            f"{old} exists and does not belong to the {texts.title}; give another name= (--name) "
-            "or another folder, or delete the file"
+            f"{old} exists and does not belong to the {title}; give another name= (--name) or "
+            "another folder, or delete the file"
         )
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -128,156 +129,133 @@ def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     return content_digest(parts)
 
 
-class _Texts:
-    """Files of a law, made from the templates of this folder."""
+def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
+    """Return the title of a law, and {ending: text} of its files, made from the templates."""
+    state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
+    names, units = law.inputs
+    known_as, kind = robot.name if robot else "unknown", "state" if state else "output"
+    title = f"{law.title} of '{known_as}'"
+    # For single precision, the bound is the unit roundoff times the number of operations.
+    error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
+    bounds = error * np.max([case.scale for case in law.cases], axis=0)
+    sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
+    array = partial(_array, real=real)
+    words: dict[str, object] = {
+        **(_DOUBLE if real == "double" else _FLOAT),
+        # C has no empty arrays: a table without rows or columns gets a row or column of zeros.
+        **{
+            key: array(np.pad(table, [(0, int(not size)) for size in table.shape]))
+            for key, table in tables.items()
+        },
+        **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
+        **{"law": law.title, "frame": law.frame or "not known", "robot": _plain(known_as)},
+        "sha256": (robot.urdf_sha256 if robot else "") or "not known",
+        "world": ", the orbital frame" if robot and robot.orbit else "",
+        **{"fflin_version": __version__, "pinocchio_version": pin.__version__},
+        "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
+        "error": f"{error:.2g}",
+        "tolerances": _listed("u", names, sizes),
+        **{"inputs": len(names), "input_list": _listed("u", names, units), "row": "0"},
+        f"{kind}_list": _listed("x" if state else "y", *law.signals),
+        "continuous": _whole(law.continuous),
+        **_test_words(law, array, error),
+    }
+    if state:
+        words |= _state_words(law, state, array)
+        words["interpolation"] = _filled("interpolation.c", words) if law.axes else ""
+    else:
+        nz = len(tables["A"])
+        words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
+    words["interface"] = _filled(f"{kind}_interface.h", words)
+    words["limiting"] = _filled("limiting.c", words).rstrip()
+    words["run"] = _filled(f"{kind}_run.c", words)
+    header, source = _filled("header.h", words), _filled(f"{kind}_law.c", words)
+    about: dict[str, object] = {
+        **{"title": title, "real": real, "frame": law.frame, "dt": law.dt},
+        "kind": "samples" if len(tables["u0"]) > 1 else kind,
+        "signals": {"input": law.inputs, kind: law.signals},
+        "nq": len(lin.q) if lin else robot.nq if robot else 0,
+        "u0": tables["u0"][0].tolist(),
+        "memory": 0 if state else len(tables["A"]),
+        "reference": None if lin is None else lin.placement.tolist(),
+        "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+    }
+    about["sha256"] = digest_of(about, header.encode(), source.encode())
+    described = json.dumps(about, indent=1) + "\n"
+    test = _filled("test.c", words)
+    return title, {".h": header, ".c": source, "_test.c": test, ".json": described}
 
-    def __init__(self, law: StateLaw | OutputLaw, name: str, real: str) -> None:
-        self.law, self.name, self.real, self.cases = law, name, real, law.cases()
-        # For single precision, the bound is the unit roundoff times the number of operations.
-        self.error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
-        bounds = self.error * np.max([case.scale for case in self.cases], axis=0)
-        sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, law.inputs[1], strict=False)]
-        robot = law.robot
-        self.kind = "state" if isinstance(law, StateLaw) else "output"
-        self.title = f"{law.title} of '{robot.name if robot else 'unknown'}'"
-        self.words: dict[str, object] = {
-            **(_DOUBLE if real == "double" else _FLOAT),
-            **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
-            **{"law": law.title, "frame": law.frame or "not known"},
-            "robot": _plain(robot.name if robot else "unknown"),
-            "sha256": (robot.urdf_sha256 if robot else "") or "not known",
-            "world": ", the orbital frame" if robot and robot.orbit else "",
-            "fflin_version": __version__,
-            "pinocchio_version": pin.__version__,
-            "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
-            "error": f"{self.error:.2g}",
-            "tolerances": _listed("u", law.inputs[0], sizes),
-            "inputs": len(law.inputs[0]),
-            "input_list": _listed("u", *law.inputs),
-            "u0": self.array(law.u0),
-            "low": self.array(law.limits[0]),
-            "high": self.array(law.limits[1]),
-            "row": "0",
+
+def _test_words(law: Law, array: Callable[[object], str], error: float) -> dict[str, object]:
+    """Return the words of the test program, with the relative error of its results."""
+    (names, _), vectors = law.inputs, []
+    for case in law.cases:
+        out = case.out.copy()
+        out[: len(names)] = np.clip(out[: len(names)], law.tables["low"], law.tables["high"])
+        numbers = map(array, (case.given, out, error * case.scale))
+        status = int((out != case.out).any())
+        vectors.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
+    outs = [*map(_plain, names), *(f"next z[{k}]" for k in range(len(out) - len(names)))]
+    return {
+        "vectors": "{\n" + ",\n".join(vectors) + "}",
+        **{"ins": len(case.given), "outs": len(outs)},
+        "out_names": ",\n".join(f'    "{each}"' for each in outs),
+    }
+
+
+def _state_words(law: Law, state: StateMap, array: Callable[[object], str]) -> dict[str, object]:
+    """Return the words of a state law alone."""
+    robot, rows = state.robot, len(law.tables["u0"])
+    n, sizes = robot.n, [len(values) for values in law.axes.values()]
+    words: dict[str, object] = {
+        **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
+        **{"rows": rows, "gains": len(law.tables["K"])},
+        "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
+        "in_reference_axes": _whole(state.axes),
+        **dict.fromkeys(("gains_between", "sample_argument", "sample_given"), ""),
+        **{"sample_comment": "", "feedback": "feed_back(0, 1, x, u);"},
+    }
+    if rows > 1:
+        words |= {
+            "sample_argument": "unsigned long sample, ",
+            "sample_given": "given->sample, ",
+            "sample_comment": "sample counts sample times from the start, 0.",
+            "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
+            "feedback": "feed_back((int)row, 1, x, u);",
         }
-        self.words |= self._state(law) if isinstance(law, StateLaw) else self._output(law)
-
-    def files(self) -> dict[str, str]:
-        """Return the files as {file name: content}."""
-        self.words["interface"] = self._filled(f"{self.kind}_interface.h")
-        self.words["limiting"] = self._filled("limiting.c").rstrip()
-        self.words |= self._vectors()
-        self.words["run"] = self._filled(f"{self.kind}_run.c")
-        law, lin = self.law, self.law.lin
-        follows = isinstance(law, StateLaw) and law.follows
-        header, source = self._filled("header.h"), self._filled(f"{self.kind}_law.c")
-        about: dict[str, object] = {
-            **{"title": self.title, "real": self.real, "frame": law.frame, "dt": law.dt},
-            "kind": "samples" if follows else self.kind,
-            "signals": {"input": law.inputs, self.kind: law.signals},
-            "nq": len(lin.q) if lin else law.robot.nq if law.robot else 0,
-            "u0": law.u0[0].tolist(),
-            "memory": len(law.terms.A) if isinstance(law, OutputLaw) else 0,
-            "reference": None if lin is None else lin.placement.tolist(),
-            "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+    if law.axes:
+        padded = [np.pad(x, (0, max(sizes) - len(x))) for x in law.axes.values()]
+        words |= {
+            **{"axis_count": len(sizes), "axis_room": max(sizes), "corners": 2 ** len(sizes)},
+            "axis_joint": _whole(robot.joint_names.index(axis) for axis in law.axes),
+            **{"axis_size": _whole(sizes), "axis_points": array(padded)},
+            "feedback": "feed_back_between(measured, x, u);",
+            "gains_between": ", K interpolated linearly between joint angles",
         }
-        about["sha256"] = digest_of(about, header.encode(), source.encode())
-        return {
-            f"{self.name}.h": header,
-            f"{self.name}.c": source,
-            f"{self.name}_test.c": self._filled("test.c"),
-            f"{self.name}.json": json.dumps(about, indent=1) + "\n",
-        }
+    return words
 
-    def _filled(self, template: str) -> str:
-        text = files("fflin.export").joinpath("templates", template).read_text("utf-8")
-        return Template(text).substitute(self.words)
 
-    def _vectors(self) -> dict[str, object]:
-        """Return the values that fill the template of the test program."""
-        law, rows, nu = self.law, [], len(self.law.inputs[0])
-        for case in self.cases:
-            out = case.out.copy()
-            out[:nu] = np.clip(out[:nu], *law.limits)
-            numbers = map(self.array, (case.given, out, self.error * case.scale))
-            status = int((out != case.out).any())
-            rows.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
-        given, out = self.cases[0].given, self.cases[0].out
-        names = [*map(_plain, law.inputs[0]), *(f"next z[{k}]" for k in range(len(out) - nu))]
-        return {
-            "vectors": "{\n" + ",\n".join(rows) + "}",
-            "ins": len(given),
-            "outs": len(out),
-            "out_names": ",\n".join(f'    "{each}"' for each in names),
-        }
+def _filled(template: str, words: dict[str, object]) -> str:
+    text = files("fflin.export").joinpath("templates", template).read_text("utf-8")
+    return Template(text).substitute(words)
 
-    def _state(self, law: StateLaw) -> dict[str, object]:
-        state, (rows, nx), follows = law.state, law.x0.shape, law.follows
-        n = state.robot.n
-        words: dict[str, object] = {
-            **{"joints": n, "joints_max": max(n, 1), "states": nx},
-            **{"rows": rows, "gains": len(law.K)},
-            "state_list": _listed("x", *law.signals),
-            "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
-            "reference": self.array(law.placements),
-            "x0": self.array(law.x0),
-            "K": self.array(law.K),
-            "in_reference_axes": _whole(state.axes),
-            "continuous": _whole(joint.unbounded for joint in state.robot.joints),
-            **dict.fromkeys(("interpolation", "gains_between", "sample_argument"), ""),
-            **dict.fromkeys(("sample_given", "sample_comment"), ""),
-            "feedback": f"feed_back({'(int)row' if follows else 0}, 1, x, u);",
-        }
-        if follows:
-            words |= {
-                "sample_argument": "unsigned long sample, ",
-                "sample_given": "given->sample, ",
-                "sample_comment": "sample counts sample times from the start, 0.",
-                "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
-            }
-        if law.axes:
-            joints, sizes = state.robot.joint_names, [len(values) for values in law.axes.values()]
-            padded = [np.pad(x, (0, max(sizes) - len(x))) for x in law.axes.values()]
-            self.words |= {
-                **{"axis_count": len(sizes), "axis_room": max(sizes), "corners": 2 ** len(sizes)},
-                "axis_joint": _whole(joints.index(name) for name in law.axes),
-                "axis_size": _whole(sizes),
-                "axis_points": self.array(padded),
-            }
-            words["interpolation"] = self._filled("interpolation.c")
-            words["feedback"] = "feed_back_between(measured, x, u);"
-            words["gains_between"] = ", K interpolated linearly between joint angles"
-        return words
 
-    def _output(self, law: OutputLaw) -> dict[str, object]:
-        by = law.terms
-        return {
-            **{"states": len(by.A), "states_max": max(len(by.A), 1), "outputs": len(by.y0)},
-            "output_list": _listed("y", *law.signals),
-            # C has no empty arrays: a matrix without rows or columns gets a zero row or column.
-            **{
-                key: self.array(np.pad(x, [(0, int(not size)) for size in x.shape]))
-                for key, x in zip("ABCD", by[:4], strict=True)
-            },
-            "y0": self.array(by.y0),
-            "continuous": _whole(law.continuous),
-        }
-
-    def array(self, values: object) -> str:
-        """Return the C initialiser of an array."""
-        values = np.asarray(values)
-        if values.ndim > 1:
-            return "{\n" + ",\n".join(map(self.array, values)) + "}"
-        if self.real == "float":
-            with np.errstate(over="ignore"):
-                narrow = values.astype(np.float32)
-            if (np.isfinite(values) & ~np.isfinite(narrow)).any():
-                raise InputError(
-                    "the law has numbers that are too large for a float; use real='double'"
-                )
-            values = narrow.astype(float)
-        end = "F" if self.real == "float" else ""
-        shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
-        return "{" + shown.replace(f"inf{end}", "NO_LIMIT") + "}"
+def _array(values: object, real: str) -> str:
+    """Return the C initialiser of an array."""
+    values = np.asarray(values)
+    if values.ndim > 1:
+        return "{\n" + ",\n".join(_array(row, real) for row in values) + "}"
+    if real == "float":
+        with np.errstate(over="ignore"):
+            narrow = values.astype(np.float32)
+        if (np.isfinite(values) & ~np.isfinite(narrow)).any():
+            raise InputError(
+                "the law has numbers that are too large for a float; use real='double'"
+            )
+        values = narrow.astype(float)
+    end = "F" if real == "float" else ""
+    shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
+    return "{" + shown.replace(f"inf{end}", "NO_LIMIT") + "}"
 
 
 def _whole(values: Iterable[int]) -> str:

@@ -60,6 +60,7 @@ _LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
+_PLAIN = (*_TEXTS, *_FIGURES)  # written as they are in the table ``info``; others as JSON
 _MATRICES = [key for key, of in _ARRAYS.items() if len(of) == 2]
 _TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
 
@@ -143,24 +144,21 @@ def _tables(entries: Record) -> dict[str, list[list[object]]]:
     """Return the tables of a model's csv files as {name of the table: rows}."""
     names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
     names["velocity"] = names["state"][-len(entries["M"]) :]
-    tables: dict[str, list[list[object]]] = {}
+    rest, tables = dict(entries), dict[str, list[list[object]]]()
+    for key in _MATRICES:
+        rows, columns = (names[each] for each in _ARRAYS[key])
+        body = zip(rows, rest.pop(key).tolist(), strict=True)
+        tables[key] = [["", *columns], *([name, *row] for name, row in body)]
     for signal in _SIGNALS:
         vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
         keys = (f"{signal}_names", f"{signal}_units", *vectors)
-        rows = zip(*(np.asarray(entries[key]).tolist() for key in keys), strict=True)
-        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, rows)]
-    info: dict[str, object] = {key: entries[key] for key in (*_TEXTS, *_FIGURES)}
-    info |= {key: ";".join(entries[key]) for key in ("locked", "ignorable", "limit_names")}
-    info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
-    for key, of in _ARRAYS.items():
-        values = entries[key].tolist()
-        if len(of) == 2:
-            body = zip(names[of[0]], values, strict=True)
-            tables[key] = [["", *names[of[1]]], *([name, *row] for name, row in body)]
-        elif of[0] not in _SIGNALS:
-            info |= {f"{key}[{i}]": value for i, value in enumerate(values)}
-    tables["info"] = [["name", "value"], *map(list, info.items())]
-    return {key: tables[key] for key in _TABLES}
+        lines = zip(*(np.asarray(rest.pop(key)).tolist() for key in keys), strict=True)
+        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
+    tables["info"] = [["name", "value"]]
+    for key, value in rest.items():
+        plain = value if key in _PLAIN else json.dumps(np.asarray(value).tolist())
+        tables["info"].append([key, plain])
+    return tables
 
 
 def _from_csv(path: Path) -> tuple[Record, bool]:
@@ -175,28 +173,17 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
             raise ValueError(
                 f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
             )
-    entries: Record = {key: [] for key in _ARRAYS} | {"certificate": {}}
+    entries: Record = {}
     for key, content in contents.items():
         header, *rows = list(csv.reader(io.StringIO(content.decode(), newline=""))) or [[]]
         if key in _MATRICES:
             entries[key] = [row[1:] for row in rows]
-            continue
-        if key != "info":
+        elif key == "info":
+            entries |= {name: x if name in _PLAIN else json.loads(x) for name, x in rows}
+        else:
             columns = list(zip(*rows, strict=True)) or [()] * len(header)
             of = (f"{key[:-1]}_names", f"{key[:-1]}_units", *header[2:])
             entries |= zip(of, columns, strict=False)
-            continue
-        for name, value in rows:
-            of_array, bracket, _ = name.partition("[")
-            _, dot, of_certificate = name.partition(".")
-            if bracket:
-                entries[of_array].append(value)
-            elif dot:
-                entries["certificate"][of_certificate] = value
-            elif name in _LISTS:
-                entries[name] = [each for each in value.split(";") if each]
-            else:
-                entries[name] = value
     return entries, bool(mark)
 
 

@@ -162,8 +162,8 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
-    # For a discrete-time model: its fingerprint, and the continuous-time model from which it was
-    # made. The latter has exact zeros that the matrix exponential loses.
+    # The fingerprint of a model that was made from another model, and that model, which has the
+    # certificate. A continuous-time model has exact zeros that the matrix exponential loses.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
@@ -171,7 +171,7 @@ class LinearModel(StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
 
-    def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
+    def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
         # A dataclass would set three dozen frozen fields one by one, which takes as long as the
         # dynamics of a small robot. Here, most fields are in `shared` for all models of a robot.
         for name, value in fields.items():
@@ -179,7 +179,7 @@ class LinearModel(StateSpace):
                 fields[name] = frozen(value.copy())
         vars(self).update(shared or {}, **fields)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         # `shared` may hold {field: function of the model} for fields that are computed at first
         # access, because they take as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
@@ -231,14 +231,6 @@ class LinearModel(StateSpace):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
-    def require(self, fingerprint: str) -> None:
-        """Raise `InputError` if the hash of A, B and f0 differs from an earlier `fingerprint`."""
-        if self.fingerprint != fingerprint:
-            raise InputError(
-                "A, B or f0 was changed after the certificate was computed; check the model with "
-                "fflin.check(robot, lin)"
-            )
-
     def require_unchanged(self) -> None:
         """Raise `ModelError` if the robot's Pinocchio model was modified after its creation."""
         if self._robot is not None:
@@ -253,13 +245,22 @@ class LinearModel(StateSpace):
         """
         if not self.dt:
             return self
-        known = self._source is not None and self._source[0] == self.fingerprint
-        return self._source[1] if self._source and known else None
+        if self._source is None or self._source[0] != self.fingerprint:
+            return None
+        return self._source[1].generator
 
     @cached_property
     def certificate(self) -> Certificate:
         """Residuals of the model, computed at the first access."""
-        return self._certify(self)
+        if self._source is None:
+            return self._certify(self)
+        fingerprint, source = self._source
+        if self.fingerprint != fingerprint:
+            raise InputError(
+                "A, B or f0 was changed after the certificate was computed; check the model with "
+                "fflin.check(robot, lin)"
+            )
+        return source.certificate
 
     @cached_property
     def ignorable(self) -> tuple[str, ...]:
@@ -357,8 +358,7 @@ class LinearModel(StateSpace):
         sampled = replace(
             self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
         )
-        certify = partial(same_certificate, self, sampled.fingerprint)
-        return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
+        return replace(sampled, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
         """Return the model in the coordinates of another tool, see `transform`."""
@@ -433,7 +433,7 @@ class LinearModel(StateSpace):
 
         values, certificate = read_model(as_path(path), Certificate)
         lin = LinearModel(**values, _certify=partial(given, certificate))
-        return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
+        return replace(lin, _source=(lin.fingerprint, lin))
 
 
 def state_space(
@@ -448,9 +448,3 @@ def state_space(
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
     return continuous.M
-
-
-def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
-    """Return a continuous-time model's certificate if the model made from it is unchanged."""
-    made.require(fingerprint)
-    return whole.certificate

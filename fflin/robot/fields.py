@@ -96,12 +96,10 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
-    found: list[Output] = []
     for item in given:
         if not isinstance(item, str | Output):
             raise InputError(f"{item!r} is not an output; expected one such as FramePose('tool')")
-        found += parse_output(item) if isinstance(item, str) else [item]
-    return tuple(found)
+    return tuple(y for x in given for y in (parse_output(x) if isinstance(x, str) else (x,)))
 
 
 def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:

@@ -192,25 +192,7 @@ def from_model(
 
 
 def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
-    _check_root(model, name)
-    require_room(model, name)
-    locked: tuple[str, ...] = ()
-    if lock is not None:
-        model, mimics, locked = locked_model(model, lock, mimics)
-    all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
-    by_name = {joint.name: joint for joint in all_joints}
-    joints = tuple(joint for joint in all_joints if joint.name not in mimics)
-    followers = tuple(
-        Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
-        for joint, mimic in mimics.items()
-    )
-    robot = Robot(model, name, None, "", joints, followers, locked=locked)
-    _check_order(model, name)
-    return robot
-
-
-def _check_root(model: pin.Model, name: str) -> None:
-    """Raise `ModelError` unless the model is one tree with one free-flyer root joint."""
+    """Make a robot of a model, which must be one depth-first tree on one free-flyer."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -223,10 +205,17 @@ def _check_root(model: pin.Model, name: str) -> None:
             f"'{name}': joint '{fixed[0]}' is attached to the world, not to the free-flyer; "
             "connect every moving link to the base"
         )
-
-
-def _check_order(model: pin.Model, name: str) -> None:
-    """Raise `ModelError` if the joints are not in depth-first order."""
+    require_room(model, name)
+    locked: tuple[str, ...] = ()
+    if lock is not None:
+        model, mimics, locked = locked_model(model, lock, mimics)
+    all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
+    by_name = {joint.name: joint for joint in all_joints}
+    joints = tuple(joint for joint in all_joints if joint.name not in mimics)
+    followers = tuple(
+        Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
+        for joint, mimic in mimics.items()
+    )
     above: list[int] = []
     for joint, parent in enumerate(model.parents.tolist()):
         while above and above[-1] != parent:
@@ -238,6 +227,7 @@ def _check_order(model: pin.Model, name: str) -> None:
                 "next branch"
             )
         above.append(joint)
+    return Robot(model, name, None, "", joints, followers, locked=locked)
 
 
 def _check_model(model: pin.Model, name: str) -> None:

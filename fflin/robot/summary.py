@@ -72,16 +72,11 @@ def _tree(robot: Robot) -> list[list[str]]:
     for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
         masses[model.parents[index]] += masses[index]
     kinds = {
-        joint: "wheel"
-        if joint.name in robot.wheels
-        else "prismatic"
-        if joint.prismatic
-        else "continuous"
-        if joint.unbounded
-        else "revolute"
+        joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         for joint in robot.joints
         if not joint.mode
     }
+    kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""

@@ -50,19 +50,14 @@ def welded(robot: Robot, lock: Lock) -> Robot:
         else each
         for each in robot.outputs
     ]
-    fields: dict[str, Any] = {
-        "locked": (*robot.locked, *locked),
-        "passive": tuple(name for name in robot.passive if name not in gone),
-        "outputs": tuple(x for x in outputs if getattr(x, "joints", None) != ()),
-    }
-    bare = replace(
-        bare,
-        model=model,
-        joints=tuple(joint.within(model) for joint in bare.joints if joint.name not in gone),
-        followers=tuple(f.within(model) for f in bare.followers if f.joint.name in left),
-        **fields,
-    )
-    return equipped(replace(robot, **fields), bare, inputs=inputs)
+    locked = (*robot.locked, *locked)
+    passive = tuple(name for name in robot.passive if name not in gone)
+    kept = tuple(x for x in outputs if getattr(x, "joints", None) != ())
+    joints = tuple(joint.within(model) for joint in bare.joints if joint.name not in gone)
+    followers = tuple(f.within(model) for f in bare.followers if f.joint.name in left)
+    bare = replace(bare, model=model, joints=joints, followers=followers, locked=locked)
+    robot = replace(robot, locked=locked, passive=passive, outputs=kept)
+    return equipped(robot, bare, inputs=inputs)
 
 
 def locked_model(

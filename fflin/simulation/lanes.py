@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
@@ -24,7 +23,7 @@ from fflin.kernel.arguments import laid_out, words_of
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
 from fflin.kernel.tree import LANES, batch_tree, work_space
 from fflin.robot.joints import ROOT
-from fflin.simulation.packing import SLOTS, noise_of, packed
+from fflin.simulation.packing import SLOTS, packed
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Recording, ending_of, go, stop_conditions, stop_of
 
@@ -52,12 +51,12 @@ def noise_generator(seed: float) -> np.random.Generator:
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
     """Return the samples (k,) between two steps, and the policy's noise (k, size) at them."""
-    times, noise = plan.times, noise_of(plan)
+    times = plan.times
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
     for row, t in zip(rows, (at * times.sample * times.dt).tolist(), strict=True):
-        if noise:
-            row[:] = vector("noise(t)", noise(t), size, "one value for each output")
+        if plan.noise:
+            row[:] = vector("noise(t)", plan.noise(t), size, "one value for each output")
     return at, rows
 
 
@@ -74,11 +73,10 @@ class Statistics:
     def reset(self) -> None:
         """Prepare for eight new runs."""
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
-        """Add rows (count, LANES, ..) of q, nu, u, momentum and centre of mass.
+    def add(self, first: int, rows: Array) -> None:
+        """Add rows (count, width, LANES) of q, nu, u, momentum and centre of mass.
 
-        The first row is at step `first`. `raw` (count * width, LANES) contains the values of
-        `rows`. The same row may be added twice.
+        The first row is at step `first`. The same row may be added twice.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
@@ -90,7 +88,7 @@ class LaneLoop:
     """The compiled loop over a plan. Threads cannot share it, because it has its own work space.
 
     `parts` are the laned arguments of the loop. A row consists of q, nu, u, momentum and centre of
-    mass, at the slices `columns`.
+    mass, which end at the columns `ends`.
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
@@ -110,19 +108,13 @@ class LaneLoop:
         self._work = work_space(self.parts.robot.tree.size)
         self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
         robot, point = self.parts.robot, self.parts.point
-        ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3]).tolist()
-        self.width, self.done = ends[-1], 0
-        self.columns = [slice(first, end) for first, end in pairwise([0, *ends])]
+        self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
+        self.width, self.done = int(self.ends[-1]), 0
         self._of_run = {
             **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
             **robot.tree._asdict(),
             **robot.faults._asdict(),
         }
-
-    def _split(self, raw: Array) -> list[Array]:
-        """Return the recorded arrays, each (rows, LANES, size)."""
-        by_row = raw.reshape(-1, self.width, LANES).transpose(0, 2, 1)
-        return [by_row[..., part] for part in self.columns]
 
     # A diverging motion overflows before it is stopped, so NumPy need not warn.
     @np.errstate(over="ignore", invalid="ignore")
@@ -151,9 +143,9 @@ class LaneLoop:
                 sense(first, last)
                 self._advance(self._words, clock, last, every, space, self._work)
                 self.done = done = int(clock[0])
-                raw = space[: (-(-done // every) - -(-first // every)) * self.width]
-                if len(raw):
-                    statistics.add(first, self._split(raw), raw)
+                if kept := -(-done // every) - -(-first // every):
+                    rows = space[: kept * self.width].reshape(kept, self.width, LANES)
+                    statistics.add(first, rows)
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
@@ -217,7 +209,7 @@ class LaneLoop:
         diverged = (stop == STOPS.index("diverged"))[:count]
         for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
             if finite:  # the last state of a diverged run may not be finite, so it is not added
-                statistics.add(self.done, self._split(last), last)
+                statistics.add(self.done, last[None])
             found = statistics.outcome(self.done, stop)
             for name, rows in out.items():
                 rows[chosen] = found[name][:count][chosen]
@@ -229,10 +221,10 @@ class LaneRows(Statistics):
     def __init__(self, times: Times, width: int) -> None:
         self.every, self.kept = times.every, np.empty((times.rows, width))
 
-    def add(self, first: int, rows: Sequence[Array], raw: Array) -> None:
+    def add(self, first: int, rows: Array) -> None:
         """Store rows; see `Statistics`."""
         begin = -(-first // self.every)
-        self.kept[begin : begin + len(rows[0])] = np.concatenate(rows, axis=2)[:, 0]
+        self.kept[begin : begin + len(rows)] = rows[..., 0]
 
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
@@ -250,7 +242,7 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center = (rows.kept[:count, part] for part in loop.columns)
+    q, nu, u, momentum, center, _ = np.split(rows.kept[:count], loop.ends, axis=1)
     v = plan.plant.state.spread(nu)
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 

@@ -320,9 +320,9 @@ class Motion(Design):
         columns = labels(names, ["s", *self.state_units, *self.input_units])
         write_table(target, columns, np.column_stack((self.t, self.x, self.u)))
 
-    def plot(self, path: str | Path | None = None, **options: Any) -> Any:
+    def plot(self, path: str | Path | None = None, *, show: Sequence[str] | None = None) -> Figure:
         """Draw the motion by `plot_motion`, and save the figure if a path is given."""
-        return plot_motion(self, path, **options)
+        return plot_motion(self, path, show=show)
 
 
 def require_motion(motion: object) -> Motion:

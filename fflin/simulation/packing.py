@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
@@ -104,12 +101,6 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
     )
 
 
-def noise_of(plan: Plan) -> Callable[[float], ArrayLike] | None:
-    """Return the measurement noise(t) of a plan's policy, or None."""
-    noise: Callable[[float], ArrayLike] | None = getattr(decider(plan.policy), "noise", None)
-    return noise
-
-
 def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy; with an allocation, of the robot `asking`."""
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
@@ -132,7 +123,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
         else:
             law = law._replace(grid=_grid(policy, state.robot.joint_names))
         law = law._replace(near=x0[state.groups.q_m].copy())
-    size, slots = len(law.measured), SLOTS if noisy or noise_of(plan) else 1
+    size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
@@ -207,12 +198,12 @@ def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
     """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
-    motion, schedule, gains = policy.trajectory, policy.schedule, policy.schedule.interpolant
+    motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    pieces = schedule.K if schedule.dt else gains.pieces
-    pieces = pieces.reshape(len(gains.starts), -1, len(u[0]) * state.nx)
+    pieces = schedule.K if schedule.dt else schedule.pieces
+    pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
     if ends:
         last = np.zeros_like(pieces[:1])
         last[0, 0] = policy.end_gain.ravel()
@@ -233,8 +224,8 @@ def _path(
         ends=bool(ends),
         held=held,
         over=policy.over,
-        last=gains.last - gains.first,
-        starts=gains.starts,
+        last=float(schedule.t[-1] - schedule.t[0]),
+        starts=schedule.starts,
         K=pieces.ravel(),
         order=pieces.shape[1],
     )

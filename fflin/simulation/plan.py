@@ -146,8 +146,8 @@ class Plan:
         for each in (*self.events, options.callback, options.disturbance):
             if not (each is None or callable(each)):
                 raise InputError(
-                    f"{each!r} is not a function; events and disturbances take (t, q, v), "
-                    "callbacks (t, q, v, u)"
+                    f"an event, the callback or the disturbance has type {type(each).__name__}, "
+                    "expected a function of (t, q, v), and of (t, q, v, u) for the callback"
                 )
         # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
         acting, self.known = chosen_limits(robot, options.limits)
@@ -177,6 +177,8 @@ class Plan:
         self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
         self.charted = lin is not None  # the run ends when the base leaves the chart of the state
         self.steered = fed_back(policy)  # states that are known to be fed back
+        # Measurement noise(t) of the policy, if any.
+        self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         self.notes = (*growing(policy), *times.notes)  # for the report
         # Time of the last stage as a fraction of the step, earlier if inputs jump at knots.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
@@ -217,30 +219,22 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
             f"'{state.robot.name}' or a model of that robot about a fixed point"
             f"{f' in frame {state.frame!r}' * bool(state.robot.orbit)}"
         )
-    goal = state.read(target.q, target.v)
-    # If the model has another reference or frame, its base states cannot be copied.
-    same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
-    for name, value in zip(target.state_names, target.x0, strict=True):
-        if same or group_of(name) == "q_m":
-            goal[state.names.index(name)] = value
-    return goal
+    near = np.zeros(state.nx)
+    near[[state.names.index(name) for name in target.state_names]] = target.x0
+    return state.read(target.q, target.v, near=near)
 
 
 def _state_of(policy: object, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion, with the frame and reference of its policy if known."""
     robot, frame, reference = options.robot, options.frame, options.reference
-    lin, _ = feedback_of(policy)
     own_frame, own_reference = axes_of(policy)
-    if lin is not None and (frame is not None or reference is not None):
+    other_frame = own_frame is not None and frame not in (None, own_frame)
+    if other_frame or (own_reference is not None and reference is not None):
         raise InputError(
-            "frame or reference is given, but the model of the policy defines both; leave them out"
+            f"frame={frame!r} or reference= is given, but the policy defines its own, with frame "
+            f"'{own_frame}'; leave them out"
         )
     if tracking_of(policy):
-        if frame not in (None, own_frame):
-            raise InputError(
-                f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are "
-                "in base axes; leave frame= out"
-            )
         refuse_orbit(robot, "trajectories to follow")
     if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
         made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")

@@ -93,13 +93,17 @@ def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | N
             limit = {"limit": joints.pop("limit")} if "limit" in joints else {}
             _below(figure, joints | limit, "joints", "left" if large else "center")
         rest = None if motion.phases else resting_from(motion)
-        marks = [*motion.starts[1:].tolist(), *([] if rest is None else [rest])]
+        phases = list(zip(motion.phases[1:], motion.starts[1:].tolist(), strict=True))
+        marks = [*(start for _, start in phases), *([] if rest is None else [rest])]
         for axes, mark in product(figure.axes, marks):
             axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
         _draw_drifts(figure.add_subplot(grid[spots[-1]]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
-        figure.suptitle(_title(motion), fontsize=11)
+        head = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
+        head += ["solid: nonlinear, dashed: linear"] * (motion.linear is not None)
+        head += [f"{name} at {start:g} s" for name, start in phases]
+        figure.suptitle(f"{'; '.join(head)}\n{motion.stopped}".strip(), fontsize=11)
     return figure
 
 
@@ -123,15 +127,6 @@ def _panels(motion: Motion, show: Sequence[str] | None) -> dict[str, list[Curve]
     for title in _WHEELS.values():
         panels |= {title: panels.pop(title)} if title in panels else {}
     return panels
-
-
-def _title(motion: Motion) -> str:
-    parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
-    if motion.linear is not None:
-        parts.append("solid: nonlinear, dashed: linear")
-    for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
-        parts.append(f"{name} at {start:g} s")
-    return "; ".join(parts) + (f"\n{motion.stopped}" if motion.stopped else "")
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:

@@ -107,7 +107,15 @@ class Plant:
         force = self.actuation.columns(self._data, q) @ u
         disturbed = None
         if self.disturbance is not None:
-            disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
+            name = f"disturbance(t, q, v) at t = {t:g} s"
+            disturbed = as_double(name, self.disturbance(t, q.copy(), v.copy()))
+            finite = np.isfinite(disturbed).all() or not np.abs(v).max() < _DIVERGED
+            if disturbed.shape != (self.robot.nv,) or not finite:
+                raise InputError(
+                    f"disturbance(t, q, v) returned shape {disturbed.shape} at t = {t:g} s, "
+                    f"expected ({self.robot.nv},) finite numbers: a generalised force in "
+                    "Pinocchio's order"
+                )
         rate = self._aba.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
         if self.field:
@@ -122,16 +130,6 @@ class Plant:
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
         return not (base or outside)
-
-    def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
-        force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
-        finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
-        if force.shape != (self.robot.nv,) or not finite:
-            raise InputError(
-                f"disturbance(t, q, v) returned shape {force.shape} at t = {t:g} s, expected "
-                f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
-            )
-        return force
 
 
 class Conserved:

@@ -24,7 +24,7 @@ from fflin.simulation.run import Conserved, Disturbance, Recording
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.tvlqr import GainSchedule
 
 # Linear model that predicts a motion, and the command (nu,) for a deviation (nx,) from its point.
 # In the deviation, the robot's states come first, then those of a continuous-time controller.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import islice, pairwise, product
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -117,7 +117,7 @@ class Worst:
 
 
 @in_one_thread
-def searched(of: Uncertain, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
+def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     size, loops = len(lft.repeats), Loops(lft, K)

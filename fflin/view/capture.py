@@ -96,29 +96,26 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
     program = find_chromium()
     try:
         with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
-            return list(_shots(browser, page, times, size, keys))
+            metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+            browser.tell("Emulation.setDeviceMetricsOverride", **metrics)
+            browser.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
+            while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
+                time.sleep(0.05)
+            shots = []
+            for index, moment in enumerate(times):
+                if keys >= 0:
+                    browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
+                # Wait for two animation frames: the first draws the scene, the second follows its
+                # display.
+                browser.evaluate(
+                    f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() "
+                    "=> requestAnimationFrame(() => done(1))))"
+                )
+                shot = browser.tell("Page.captureScreenshot", format="png")
+                shots.append(base64.b64decode(shot["data"]))
+            return shots
     except (OSError, _BrowserError) as error:
         raise FileError(f"{program} cannot take a picture of {page}: {error}") from None
-
-
-def _shots(
-    browser: _Browser, page: Path, times: Sequence[float], size: tuple[int, int], keys: int
-) -> Iterator[bytes]:
-    browser.open_tab()
-    metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
-    browser.tell("Emulation.setDeviceMetricsOverride", **metrics)
-    browser.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
-    while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
-        time.sleep(0.05)
-    for index, moment in enumerate(times):
-        if keys >= 0:
-            browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
-        # Wait for two animation frames: the first draws the scene, the second follows its display.
-        browser.evaluate(
-            f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
-            "requestAnimationFrame(() => done(1))))"
-        )
-        yield base64.b64decode(browser.tell("Page.captureScreenshot", format="png")["data"])
 
 
 @contextmanager
@@ -172,7 +169,11 @@ class _Browser:
         self._commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
+        # All further commands are sent to one tab.
         self._session: dict[str, str] = {}
+        target = self.tell("Target.createTarget", url="about:blank")
+        attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+        self._session = {"sessionId": attached["sessionId"]}
 
     def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
@@ -180,28 +181,19 @@ class _Browser:
         command = {"id": self._number, "method": method, "params": parameters, **self._session}
         with suppress(BrokenPipeError):  # reading the answer reports the error
             self._commands.write(json.dumps(command).encode() + b"\0")
-        while (answer := self._message()).get("id") != self._number:
-            pass  # skip messages that are not the answer
+        answer: dict[str, Any] = {}
+        while answer.get("id") != self._number:  # skip messages that are not the answer
+            pieces = [self._rest]
+            while b"\0" not in pieces[-1]:
+                pieces.append(self._answers.read(2**20))
+                if not pieces[-1]:
+                    raise _BrowserError("the browser does not respond")
+            text, _, self._rest = b"".join(pieces).partition(b"\0")
+            answer = json.loads(text)
         if "error" in answer:
             raise _BrowserError(answer["error"].get("message"))
         result: dict[str, Any] = answer["result"]
         return result
-
-    def _message(self) -> dict[str, Any]:
-        pieces = [self._rest]
-        while b"\0" not in pieces[-1]:
-            pieces.append(self._answers.read(2**20))
-            if not pieces[-1]:
-                raise _BrowserError("the browser does not respond")
-        text, _, self._rest = b"".join(pieces).partition(b"\0")
-        message: dict[str, object] = json.loads(text)
-        return message
-
-    def open_tab(self) -> None:
-        """Open a tab, to which all further commands are sent."""
-        target = self.tell("Target.createTarget", url="about:blank")
-        attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
-        self._session = {"sessionId": attached["sessionId"]}
 
     def quit(self) -> None:
         """Ask the browser to quit; unlike a killed browser, it then removes its temporary files."""

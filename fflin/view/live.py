@@ -8,9 +8,9 @@ import json
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from time import monotonic, sleep
-from typing import Any
+from typing import TypeAlias, TypedDict
 
 import numpy as np
 from tornado.httpserver import HTTPServer
@@ -22,10 +22,13 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import Page, corner_points, subtitle
-from fflin.view.scene import body_nodes, body_poses
+from fflin.view.page import Page, subtitle
+from fflin.view.scene import body_poses
 
 _HOST = "127.0.0.1"
+
+# Request of a browser: {"joints": {name: value}}, or a true value of "neutral" or "random".
+Request: TypeAlias = "Mapping[str, Mapping[str, float]]"
 
 
 class Live:
@@ -55,7 +58,7 @@ class Live:
         *,
         scene: str = "space",
         tool: str | None = None,
-        follow: bool = False,
+        follow: bool | None = None,
         speed: float = 1.0,
         port: int = 0,
         frame: str | None = None,
@@ -75,11 +78,11 @@ class Live:
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         html = page.html(
             "live",
-            corner_points(page.drawing, poses),
-            follow=follow,
+            page.drawing.points(poses),
+            follow=bool(follow),
             joints=self._joints,
             names=[*axes, *robot.joint_names],
-            bodies=body_nodes(robot),
+            bodies=page.nodes,
         )
         self._server = Server(html, page.window.commands, self._asked, port)
         self.url = page.window.web_url = self._server.url
@@ -136,26 +139,33 @@ class Live:
         if hasattr(self, "_server"):
             self._server.send(command)
 
-    def _asked(self, message: Any) -> None:
-        """Execute a request of a browser: {"joints": {name: value}}, "neutral" or "random"."""
+    def _asked(self, message: Request) -> None:
         q = self.q.copy()
         if message.get("neutral"):
             q[7:] = self.robot.neutral()[7:]
-        limits = {each["name"]: each for each in self._joints}
         wanted = dict(message.get("joints", {}))
         if message.get("random"):
-            rng = np.random.default_rng()
-            wanted = {name: rng.uniform(x["low"], x["high"]) for name, x in limits.items()}
+            uniform = np.random.default_rng().uniform
+            wanted = {each["name"]: uniform(each["low"], each["high"]) for each in self._joints}
         for name, value in wanted.items():
             self.robot.joint(name).place(q, float(value))
         self.robot.follow(q)
         self.show(q)
 
 
-def _joints(robot: Robot) -> list[dict[str, Any]]:
+class Slider(TypedDict):
+    """Slider of a joint on the page, with its range [rad|m|kg^0.5 m]."""
+
+    name: str
+    low: float
+    high: float
+    length: bool  # whether the joint is prismatic
+
+
+def _joints(robot: Robot) -> list[Slider]:
     """Return name and range of the slider of each joint except wheels."""
     model = robot.model
-    found = []
+    found = list[Slider]()
     for joint in robot.joints:
         if joint.name in robot.wheels:
             continue
@@ -177,21 +187,26 @@ class Server:
         self,
         page: str,
         scene: Callable[[], Iterable[bytes]],  # returns the commands for a new browser
-        asked: Callable[[object], None],  # is called with each message of a browser
+        asked: Callable[[Request], None],  # is called with each message of a browser
         port: int,  # 0 for a free port
     ) -> None:
-        self.scene, self.asked = scene, asked
+        self.page, self.scene, self.asked = page, scene, asked
         self.state = "{}"
         self.clients: set[_Socket] = set()
-        listener = _listen(port)
+        try:
+            listener = socket.create_server((_HOST, port), backlog=128)
+        except OSError as error:
+            why = os.strerror(error.errno or 0)
+            raise InputError(
+                f"port {port} is not available: {why}; give another port, or 0 for a free port"
+            ) from None
+        listener.setblocking(False)
         self.port: int = listener.getsockname()[1]
         self.url = f"http://{_HOST}:{self.port}/"
-        hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
+        self.hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
+        given = {"server": self}
         application = Application(
-            [
-                ("/", _Page, {"hosts": hosts, "page": page}),
-                ("/socket", _Socket, {"hosts": hosts, "server": self}),
-            ],
+            [("/", _Page, given), ("/socket", _Socket, given)],
             log_function=lambda _: None,
             websocket_ping_interval=20,
         )
@@ -248,32 +263,14 @@ class Server:
                 self._loop.call_soon_threadsafe(what)
 
 
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        if os.name == "posix":  # elsewhere the option would let two servers share a port
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((_HOST, port))
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        raise InputError(
-            f"port {port} is not available: {error.strerror}; give another port, or 0 for a free "
-            "port"
-        ) from None
-    listener.setblocking(False)
-    return listener
-
-
 class _Guarded(RequestHandler):
     """Handler that accepts only this machine's names as host, and so refuses other sites' pages."""
 
-    def initialize(self, hosts: set[str], **fields: Any) -> None:
-        self._hosts = hosts
-        self._fields = fields
+    def initialize(self, server: Server) -> None:
+        self._server = server
 
     def prepare(self) -> None:
-        if self.request.host not in self._hosts:
+        if self.request.host not in self._server.hosts:
             raise HTTPError(403)
 
     def set_default_headers(self) -> None:
@@ -283,7 +280,7 @@ class _Guarded(RequestHandler):
 class _Page(_Guarded):
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
-        self.write(self._fields["page"])
+        self.write(self._server.page)
 
 
 class _Socket(_Guarded, WebSocketHandler):
@@ -293,28 +290,27 @@ class _Socket(_Guarded, WebSocketHandler):
     _behind = False
 
     def check_origin(self, origin: str) -> bool:
-        return origin.partition("://")[2] in self._hosts
+        return origin.partition("://")[2] in self._server.hosts
 
     def open(self, *_: str, **__: str) -> None:
-        server: Server = self._fields["server"]
-        server.clients.add(self)
-        for message in server.scene():
+        self._server.clients.add(self)
+        for message in self._server.scene():
             self.send(message)
         self.update()
 
     def on_close(self) -> None:
-        self._fields["server"].clients.discard(self)
+        self._server.clients.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
         # Invalid messages are ignored, and too deeply nested messages close the connection.
         try:
-            self._fields["server"].asked(json.loads(message))
+            self._server.asked(json.loads(message))
         except (FflinError, ValueError, TypeError, AttributeError, ArithmeticError):
             return
         except RecursionError:
             self.close(1008, "nested too deep")
 
-    def send(self, content: bytes | str) -> Any:
+    def send(self, content: bytes | str) -> asyncio.Future[None] | None:
         try:
             return self.write_message(content, binary=isinstance(content, bytes))
         except WebSocketClosedError:
@@ -324,7 +320,7 @@ class _Socket(_Guarded, WebSocketHandler):
         if self._busy:
             self._behind = True
             return
-        sent = self.send(self._fields["server"].state)
+        sent = self.send(self._server.state)
         if sent is None:
             return
         self._busy = True

@@ -28,7 +28,7 @@ from fflin.robot.equipment.mounting import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
-from fflin.view.scene import Drawing, Visualizer, body_nodes
+from fflin.view.scene import Drawing, Visualizer
 
 Lowered = dict[str, Any]
 
@@ -147,7 +147,21 @@ class Page:
         self.window, self._sent = Recorder(forward), set[str]()
         self.meshcat = Visualizer(window=self.window)
         self.drawing = self.draw(robot, "robot")
+        # Path of each body's node, in the order of Pinocchio's joints from 1 on.
+        self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
         self.entries: dict[str, object] = {}
+        # Each thruster's name, with its node and its position and force direction there.
+        self.nozzles: list[tuple[str, dict[str, object]]] = [
+            (
+                name,
+                {
+                    "path": self.nodes[joint - ROOT],
+                    "position": position.tolist(),
+                    "direction": direction.tolist(),
+                },
+            )
+            for name, joint, position, direction in thrusters(robot)
+        ]
         self.floor = [0.0, 0.0, 0.0]  # [m] point of the floor below the robot
         self.size = 1.0  # [m] radius of the robot in the first frame
 
@@ -157,8 +171,8 @@ class Page:
 
     def set_stage(self, poses: Array, about: str, held: Sequence[Drawing] = ()) -> None:
         """Set the entries of the stage by the poses (njoints - 1, 7) of the first frame."""
-        robot = self.robot
-        points = corner_points(self.drawing, poses)
+        robot, nodes = self.robot, self.nodes
+        points = self.drawing.points(poses)
         low, high = points.min(axis=0), points.max(axis=0)
         centre = (low + high) / 2.0
         size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
@@ -175,24 +189,25 @@ class Page:
                 "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
                 "orbit": {"body": robot.orbit.body, "distance": far, "rate": rate},
             }
-        nodes = body_nodes(robot)
         triads = [{"path": nodes[0], "length": 0.3 * size, **_placed(pin.SE3.Identity())}]
         if self.tool:
             joint, placement = find_frame(robot.model, self.tool)
             triad = {"path": nodes[joint - ROOT], "length": 0.12 * size, **_placed(placement)}
             triads.append(triad)
+        named, wheels = named_wheels(robot.inputs), list[dict[str, object]]()
+        for name, wheel in named:
+            joint, at = find_frame(robot.model, wheel.frame)
+            axis, several = np.array(wheel.axis), [each.frame for _, each in named]
+            apart = _APART * size * (several.count(wheel.frame) > 1)
+            placement = at * pin.SE3(turned_to(axis), apart * axis)
+            # The wheel spins with its body if its speed is a state.
+            spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
+            wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         self.entries = {
             **orbit,
             "triads": triads,
-            "nozzles": [
-                {
-                    "path": nodes[joint - ROOT],
-                    "position": position.tolist(),
-                    "direction": direction.tolist(),
-                }
-                for _, joint, position, direction in thrusters(robot)
-            ],
-            "wheels": _wheels(robot, size),
+            "nozzles": [nozzle for _, nozzle in self.nozzles],
+            "wheels": wheels,
             "links": {k: link for each in (self.drawing, *held) for k, link in each.links.items()},
             "title": robot.name,
             "subtitle": about,
@@ -232,17 +247,6 @@ class Page:
         )
 
 
-def corner_points(drawing: Drawing, poses: Array) -> Array:
-    """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
-    return np.concatenate(
-        [
-            np.array([placement.act(corner) for corner in corners])
-            for joint, corners in zip(drawing.bodies, drawing.corners, strict=True)
-            for placement in [pin.XYZQUATToSE3(poses[joint - ROOT])]
-        ]
-    )
-
-
 def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
     """Return each thruster's name, joint, and position and force direction in the joint's frame."""
     found: list[tuple[str, int, Array, Array]] = []
@@ -254,21 +258,6 @@ def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
             position = placement.act(np.array(item.position))
             direction = placement.rotation @ np.array(item.direction)
             found.append((names[len(found)], joint, position, direction))
-    return found
-
-
-def _wheels(robot: Robot, size: float) -> list[dict[str, object]]:
-    """Return the wheels at their frames, with the spinning body if the wheel's speed is a state."""
-    named, nodes = named_wheels(robot.inputs), body_nodes(robot)
-    frames = [wheel.frame for _, wheel in named]
-    found = list[dict[str, object]]()
-    for name, wheel in named:
-        joint, frame = find_frame(robot.model, wheel.frame)
-        axis = np.array(wheel.axis)
-        apart = _APART * size * (frames.count(wheel.frame) > 1)
-        placement = frame * pin.SE3(turned_to(axis), apart * axis)
-        spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
-        found.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
     return found
 
 

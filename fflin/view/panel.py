@@ -88,7 +88,14 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # it may be missing in a file
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
-    lines = _lines(robot, motion, shown, followed=len(target) > 1)
+    # Curves that are not always zero, by group and unit.
+    lines: dict[tuple[str, str], list[Curve]] = {}
+    for each in curves(motion):
+        followed = each.reference if len(target) > 1 else None
+        reference = None if followed is None else followed[shown]
+        curve = each._replace(values=each.values[shown], reference=reference)
+        if _size(curve) >= _NOTHING:
+            lines.setdefault((curve.group, curve.unit), []).append(curve)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
             near = lines.get(key, [])
@@ -107,19 +114,6 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         "rest": resting_from(motion) if len(target) > 1 and not motion.phases else None,
         "passed": [[str(each), each.time] for each in motion.passed],
     }
-
-
-def _lines(
-    robot: Robot, motion: Motion, shown: Array, *, followed: bool
-) -> dict[tuple[str, str], list[Curve]]:
-    """Return the curves at the rows `shown` that are not always zero, by (group, unit)."""
-    found: dict[tuple[str, str], list[Curve]] = {}
-    for each in curves(motion):
-        reference = each.reference[shown] if followed and each.reference is not None else None
-        curve = each._replace(values=each.values[shown], reference=reference)
-        if _size(curve) >= _NOTHING:
-            found.setdefault((curve.group, curve.unit), []).append(curve)
-    return found
 
 
 def _size(curve: Curve) -> float:

@@ -15,7 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
-from fflin.view.shapes import PLAIN, Indices, Mesh, Shape, bendings, load_mesh, shapes
+from fflin.view.shapes import PLAIN, Color, Indices, Mesh, Shape, bendings, load_mesh, shapes
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
@@ -28,34 +28,7 @@ _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
 # Placeholder for a mesh that the page already has.
-_ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
-
-
-def _object(geometry: dict[str, Any], matrix: Array, about: dict[str, object]) -> dict[str, object]:
-    """Return a three.js mesh as sent to the page, which has its material and known geometry."""
-    return {
-        "metadata": {"version": 4.5, "type": "Object"},
-        "geometries": [geometry],
-        "materials": [{"uuid": "material", "type": "MeshStandardMaterial"}],
-        "object": {
-            "uuid": "object",
-            "type": "Mesh",
-            "geometry": geometry["uuid"],
-            "material": "material",
-            "matrix": matrix.T.ravel().tolist(),
-            "userData": about,
-        },
-    }
-
-
-def body_paths(robot: Robot) -> list[str]:
-    """Return the node name of each body, in the order of Pinocchio's joints from 1 on."""
-    return [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
-
-
-def body_nodes(robot: Robot) -> list[list[str]]:
-    """Return the path of each body's node on a page, in the order of `body_paths`."""
-    return [["meshcat", "robot", path] for path in body_paths(robot)]
+_ELSEWHERE: dict[str, object] = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
@@ -81,29 +54,42 @@ class Drawing:
         sent: set[str] | None = None,
         prefix: str = "",
     ) -> None:
-        self.robot = robot
+        self.robot, self.prefix = robot, prefix
         self._visualizer = visualizer
-        self._paths = body_paths(robot)
+        # Node name of each body, in the order of Pinocchio's joints from 1 on.
+        self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
         sent = set() if sent is None else sent  # meshes that were sent to the page, updated below
         found, self.notes = shapes(robot)  # shapes, and notes about missing drawings
         self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
-            node = visualizer[self._paths[shape.joint - ROOT]]
+            node = visualizer[self.paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
-                about = {"finish": shape.finish, "color": color, "look": look}
+                about: dict[str, object] = {"finish": shape.finish, "color": color, "look": look}
                 if look in ("real", "held"):
-                    about["link"] = ".".join(filter(None, (prefix, shape.link)))
-                    self.links.setdefault(about["link"], _link(robot, shape))
-                shown = geometry
+                    about["link"] = link = ".".join(filter(None, (prefix, shape.link)))
+                    self.links.setdefault(link, _link(robot, shape))
+                identity = str(geometry["uuid"])
+                shown = _ELSEWHERE if identity in sent else geometry
                 if geometry["type"] == "BufferGeometry":
-                    about["mesh"] = geometry["uuid"]
-                    shown = _ELSEWHERE if geometry["uuid"] in sent else geometry
-                    sent.add(geometry["uuid"])
+                    about["mesh"] = identity
+                    sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
-                self._send(
-                    "set_object", node[f"{index}_{part}"], object=_object(shown, placed, about)
-                )
+                # A three.js mesh; the page has its material and known geometry.
+                content = {
+                    "metadata": {"version": 4.5, "type": "Object"},
+                    "geometries": [shown],
+                    "materials": [{"uuid": "material", "type": "MeshStandardMaterial"}],
+                    "object": {
+                        "uuid": "object",
+                        "type": "Mesh",
+                        "geometry": shown["uuid"],
+                        "material": "material",
+                        "matrix": placed.T.ravel().tolist(),
+                        "userData": about,
+                    },
+                }
+                self._send("set_object", node[f"{index}_{part}"], object=content)
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
         self.bodies = list(corners)  # Pinocchio joints
         self.corners = [
@@ -112,9 +98,17 @@ class Drawing:
 
     def place(self, poses: Array) -> None:
         """Set the poses of all bodies: (njoints - 1, 7) with x, y, z and quaternion x, y, z, w."""
-        for path, pose in zip(self._paths, poses, strict=True):
+        for path, pose in zip(self.paths, poses, strict=True):
             matrix = pin.XYZQUATToSE3(pose).homogeneous.T.ravel().tolist()
             self._send("set_transform", self._visualizer[path], matrix=matrix)
+
+    def points(self, poses: Array) -> Array:
+        """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
+        found = []
+        for joint, corners in zip(self.bodies, self.corners, strict=True):
+            placement = pin.XYZQUATToSE3(poses[joint - ROOT])
+            found += [placement.act(corner) for corner in corners]
+        return np.array(found)
 
     def _send(self, kind: str, node: Visualizer, **entries: object) -> None:
         node.window.record({"type": kind, "path": node.path.lower(), **entries})
@@ -123,7 +117,7 @@ class Drawing:
         """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
         times = typed(t)
         clips = []
-        for index, path in enumerate(self._paths):
+        for index, path in enumerate(self.paths):
             tracks = [
                 {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
                 {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
@@ -158,7 +152,7 @@ def typed(array: Array | Indices, kind: str = "<f4") -> Any:
     return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
 
 
-def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
+def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]:
     """Return geometry, matrix, colour, and two corners of the bounding box of each piece."""
     unit = np.eye(4)
     if shape.kind == "mesh":
@@ -168,26 +162,28 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
             (_triangles(mesh), scale, shape.color or mesh.color or PLAIN, _bounds(mesh.vertices))
             for mesh in load_mesh(shape.mesh)
         ]
-    color = shape.color or PLAIN
+    color, found = shape.color or PLAIN, list[tuple[dict[str, object], Array, Color, Array]]()
+
+    def add(name: str, matrix: Array, half: Sequence[float], **sizes: float) -> None:
+        geometry = {"uuid": name.lower(), "type": f"{name}Geometry", **sizes}
+        found.append((geometry, matrix, color, np.array([np.negative(half), half])))
+
     if shape.kind == "box":
-        sides = dict(zip(("width", "height", "depth"), shape.size, strict=True))
-        box = {"uuid": "box", "type": "BoxGeometry", **sides}
-        return [(box, unit, color, _symmetric(*(side / 2.0 for side in shape.size)))]
-    radius = shape.size[0]
-    fineness: dict[str, Any] = {"widthSegments": 32, "heightSegments": 20}
-    ball = {"uuid": "sphere", "type": "SphereGeometry", "radius": radius, **fineness}
-    around = _symmetric(radius, radius, radius)
-    if shape.kind == "sphere":
-        return [(ball, unit, color, around)]
-    length = shape.size[1]
-    sides = {"radiusTop": radius, "radiusBottom": radius, "height": length}
-    tube = {"uuid": "cylinder", "type": "CylinderGeometry", **sides, "radialSegments": 40}
-    pieces = [(tube, _Y_TO_Z, color, _symmetric(radius, length / 2.0, radius))]
-    if shape.kind == "capsule":
-        for end in (-length / 2.0, length / 2.0):
-            lifted = pin.SE3(np.eye(3), np.array((0.0, 0.0, end))).homogeneous
-            pieces.append((ball, lifted, color, around))
-    return pieces
+        width, height, depth = shape.size
+        half = [side / 2.0 for side in shape.size]
+        add("Box", unit, half, width=width, height=height, depth=depth)
+        return found
+    radius, ends = shape.size[0], [0.0]
+    if shape.kind != "sphere":
+        length = shape.size[1]
+        sizes = {"radiusTop": radius, "radiusBottom": radius, "height": length}
+        add("Cylinder", _Y_TO_Z, (radius, length / 2.0, radius), **sizes, radialSegments=40)
+        ends = [-length / 2.0, length / 2.0] if shape.kind == "capsule" else []
+    for end in ends:
+        lifted = pin.SE3(np.eye(3), np.array((0.0, 0.0, end))).homogeneous
+        fineness = {"widthSegments": 32, "heightSegments": 20}
+        add("Sphere", lifted, (radius, radius, radius), radius=radius, **fineness)
+    return found
 
 
 def _triangles(mesh: Mesh) -> dict[str, object]:
@@ -202,10 +198,6 @@ def _triangles(mesh: Mesh) -> dict[str, object]:
             "attributes": {"position": {**corners, "normalized": False}},
         },
     }
-
-
-def _symmetric(*half: float) -> Array:
-    return np.array([np.negative(half), half])
 
 
 def _bounds(points: Array) -> Array:

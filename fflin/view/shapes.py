@@ -58,19 +58,15 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
         return tuple(_inertia_boxes(robot)), tuple(notes)
     for prefix, other in robot.attached:
         theirs, said = shapes(other)
-        found += (_carried(robot, prefix, other, shape) for shape in theirs)
         notes += said
+        for shape in theirs:
+            joint, held = find_frame(robot.model, prefix)
+            if shape.joint > ROOT:
+                name = other.model.names[shape.joint]
+                joint, held = find_joint(robot.model, f"{prefix}.{name}")
+            placement, link = held * shape.placement, f"{prefix}.{shape.link}"
+            found.append(replace(shape, joint=joint, placement=placement, link=link))
     return tuple(found), tuple(notes)
-
-
-def _carried(robot: Robot, prefix: str, other: Robot, shape: Shape) -> Shape:
-    """Convert a shape of a grasped payload to a shape of the robot that carries it."""
-    held_by = find_frame(robot.model, prefix)
-    if shape.joint > ROOT:
-        held_by = find_joint(robot.model, f"{prefix}.{other.model.names[shape.joint]}")
-    joint, held = held_by
-    link = f"{prefix}.{shape.link}"
-    return replace(shape, joint=joint, placement=held * shape.placement, link=link)
 
 
 def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
@@ -95,7 +91,9 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
-        joint, at = _node_of(frame, bent)
+        bending = bent.get(frame.name)
+        joint = bending.node if bending else frame.parentJoint
+        at = bending.frame.actInv(frame.placement) if bending else frame.placement
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
@@ -145,20 +143,18 @@ def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
 
 
 def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
-    materials = visual.find_all("material")
     none = None if kind == "mesh" else PLAIN
-    if not materials:
-        return none, ""
-    name = materials[0].attributes.get("name", "")
-    return _color(materials[0]) or colors.get(name, none), name
+    for material in visual.find_all("material"):
+        name = material.attributes.get("name", "")
+        return _color(material) or colors.get(name, none), name
+    return none, ""
 
 
 def _color(material: Element) -> Color | None:
-    found = material.find_all("color")
-    if not found:
-        return None
-    r, g, b, a = (min(max(x, 0.0), 1.0) for x in found[0].vector("rgba", 4))
-    return r, g, b, a
+    for found in material.find_all("color"):
+        r, g, b, a = (min(max(x, 0.0), 1.0) for x in found.vector("rgba", 4))
+        return r, g, b, a
+    return None
 
 
 def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
@@ -243,13 +239,6 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     return found
 
 
-def _node_of(frame: pin.Frame, bent: dict[str, Bending]) -> tuple[int, pin.SE3]:
-    """Return the Pinocchio joint whose node carries a link's frame, and its placement there."""
-    if bending := bent.get(frame.name):
-        return bending.node, bending.frame.actInv(frame.placement)
-    return frame.parentJoint, frame.placement
-
-
 def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
     """Yield the shapes that represent undrawn appendages."""
     for item in robot.appendages:
@@ -330,17 +319,16 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
     try:
         scene = trimesh.load_scene(path, process=False)
         meshes = [mesh for mesh in scene.convert_units("meters").dump() if hasattr(mesh, "faces")]
-        return [(mesh.vertices, mesh.faces, _face_color(mesh)) for mesh in meshes]
+        found = list[tuple[Array, Indices, Color | None]]()
+        for mesh in meshes:
+            color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
+            if color is not None:  # None stands for a texture, or nothing
+                r, g, b, a = (float(x) / 255.0 for x in color)
+                color = r, g, b, a or 1.0
+            found.append((mesh.vertices, mesh.faces, color))
     except Exception:  # a malformed file may raise anything
         return []
-
-
-def _face_color(mesh: Any) -> Color | None:
-    color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
-    if color is None:
-        return None  # a texture, or nothing
-    r, g, b, a = (float(x) / 255.0 for x in color)
-    return r, g, b, a or 1.0
+    return found
 
 
 def _triangles(path: Path) -> tuple[Array, Indices]:

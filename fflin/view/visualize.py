@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from warnings import warn
 
 import pinocchio as pin
@@ -169,9 +169,10 @@ def visualize(
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
-        how: Any = {"scene": scene, "tool": tool, "follow": bool(follow), "frame": frame}
         pace = positive("speed", 1.0 if speed is None else speed)
-        live = Live(robot, start, **how, speed=pace, port=port)
+        live = Live(
+            robot, start, scene=scene, tool=tool, follow=follow, speed=pace, port=port, frame=frame
+        )
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -186,17 +187,18 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        from fflin.view.mode_page import mode_page
+        from fflin.view.pages import mode_page
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
     else:
         robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-        from fflin.view.motion_page import motion_page
+        from fflin.view.pages import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        how = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
-        page, notes = motion_page(robot, motion, **how, tool=tool)
+        page, notes = motion_page(
+            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
+        )
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)

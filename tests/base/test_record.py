@@ -61,7 +61,7 @@ def content(thing):
         held["ignorable"] = thing.ignorable
     if isinstance(thing, fflin.LinearBatch):
         held["ignorable"] = thing[0].ignorable
-    for name in ("_ignorable", "_robot"):
+    for name in ("_ignorable", "_robot", "_source"):
         held.pop(name, None)
     return held
 

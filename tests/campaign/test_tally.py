@@ -157,9 +157,8 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
         lanes = RunStatistics(job.plan, state, home, job.steps, way)
         lanes.reset()
         for first, last in itertools.pairwise(cuts):
-            some = [each[first:last] for each in (q, nu, u)]
             for _ in range(2):  # adding rows again changes nothing
-                lanes.add(first, some, rows[first:last].copy().reshape(-1, LANES))
+                lanes.add(first, rows[first:last].copy())
         ends.append(lanes.outcome(STEPS - 1, stop))
         plain = [
             defined(job, home, *(each[:, lane] for each in (q, nu, u)), stop[lane])

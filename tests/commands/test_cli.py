@@ -15,6 +15,7 @@ import pytest
 import fflin
 from fflin.base.tables import matrix
 from fflin.commands import cli
+from fflin.commands.options import ROBOT
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run, without_warnings
 from tests.support.messages import says
@@ -609,9 +610,8 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
 def test_options_that_repeat_a_robot_file_are_in_one_group():
     repeated = {"lock", "orbit", "stiffness", "damping", "gravity", "passive", "inputs", "output"}
     (parsers,) = cli._parser("")._subparsers._group_actions
-    title = "robot (these options override robot.toml)"
     for name in ("linearize", "check", "lqr", "simulate", "sweep", "montecarlo", "funnel"):
-        (group,) = (x for x in parsers.choices[name]._action_groups if x.title == title)
+        (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
         assert {each.dest for each in group._group_actions} == repeated, name
 
 

@@ -8,8 +8,8 @@ import pytest
 from scipy.optimize import linprog, nnls
 
 import fflin
-from fflin.control import horizon
-from fflin.control.horizon import Receding, condensed
+from fflin.control import mpc as predictive
+from fflin.control.mpc import Receding, condensed
 from fflin.simulation.report import motion_report
 from tests.support.messages import says
 
@@ -356,7 +356,7 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
     robot, lin = servicer
     limits = ["urdf", WEAK]
     policy = fflin.mpc(lin, *weights(lin), dt=0.25, limits=limits)
-    monkeypatch.setattr(horizon, "_MOST", 1)
+    monkeypatch.setattr(predictive, "_MOST", 1)
     with pytest.warns(fflin.FflinWarning, match="DAQP") as said:
         options = {"q0": turned(robot, 60.0), "duration": 1.0, "limits": limits}
         flown = fflin.simulate(robot, policy, **options)

@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.control.optimal.plan_search import StageQP
 from fflin.control.optimal.shooting import Shooting
-from fflin.control.optimal.stage_qp import StageQP
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 from tests.support.speeds import largest_speeds

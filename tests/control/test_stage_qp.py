@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fflin import MissingPackageError
-from fflin.control.optimal.stage_qp import StageQP, StageRows
+from fflin.control.optimal.plan_search import StageQP, StageRows
 
 N, NX, NU = 6, 3, 2
 

@@ -333,7 +333,9 @@ def test_eight_lanes_are_eight_runs(robots):
     out = {"end": np.empty(8)}
     together.fly(kept, out, {key: np.array([each[key] for each in runs]) for key in runs[0]})
     assert (out["end"] == 200.0).all()
-    q, u = (np.concatenate([rows[k] for rows in kept.slices]) for k in (0, 2))
+    first, second, third = together.ends[:3]
+    rows = np.concatenate(kept.slices).transpose(0, 2, 1)
+    q, u = rows[..., :first], rows[..., second:third]
     for lane, plan in enumerate(plans):
         motion = run.go(plan)
         np.testing.assert_allclose(q[:20, lane], motion.q[:200:10], rtol=0, atol=1e-12)
@@ -350,8 +352,8 @@ class Kept(lanes.Statistics):
     def __init__(self):
         self.slices = []
 
-    def add(self, first, rows, raw):
-        self.slices.append([each.copy() for each in rows])
+    def add(self, first, rows):
+        self.slices.append(rows.copy())
 
     def outcome(self, done, stop):
         return {"end": np.full(8, float(done))}

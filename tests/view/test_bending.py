@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.mode_page import mode_page
+from fflin.view.pages import mode_page
 from fflin.view.panel import panel
 from fflin.view.scene import body_poses
 from fflin.view.shapes import shapes

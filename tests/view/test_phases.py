@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.robot.joints import ROOT
-from fflin.view.motion_page import _flight
+from fflin.view.pages import _flight
 from tests.support.phases import DEBRIS, TWIST, phases
 
 # Positions travel as 32-bit floats, of metres.

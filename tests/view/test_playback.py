@@ -6,8 +6,8 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.motion_page import play_back
 from fflin.view.page import thrusters
+from fflin.view.pages import play_back
 from tests.support.robots import random_point, random_pose
 
 FRAMES = ("hybrid", "local", "world")

@@ -14,7 +14,7 @@ import pytest
 
 import fflin
 from fflin.commands.cli import main
-from fflin.view.motion_page import frame_indices
+from fflin.view.pages import frame_indices
 from fflin.view.visualize import default_tool
 from tests.support.messages import hear_lines, says
 from tests.support.motions import settling

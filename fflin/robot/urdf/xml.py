@@ -187,11 +187,10 @@ def parse(document: bytes, origin: str) -> Element:
     opened, count, parser = [top], 0, expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        owner, name = opened[-1].owner, attributes.get("name", "")
-        if tag in ("link", "joint") and name.strip():
-            owner = f"{tag} {quoted(name)}"
-        line = parser.CurrentLineNumber
-        element = Element(tag, attributes, line, origin, owner, notes=top.notes)
+        owner, line = opened[-1].owner, parser.CurrentLineNumber
+        if tag in ("link", "joint") and attributes.get("name", "").strip():
+            owner = f"{tag} {quoted(attributes['name'])}"
+        element = Element(tag, attributes, line, origin, owner, [], top.notes)
         if len(opened) > _DEPTH_LIMIT:
             raise element.error(f"more than {_DEPTH_LIMIT} elements deep; find the missing end tag")
         nonlocal count

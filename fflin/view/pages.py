@@ -1,32 +1,42 @@
-"""The page of a motion: the robots in the scene, and the panel of numbers and plots."""
+"""The page of a motion, with its panel of numbers and plots, and the page of natural modes.
+
+The page of natural modes animates the modes of a robot, one at a time.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.analysis.modes import Mode, Modes, energies_of
+from fflin.base.errors import InputError
+from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import find_frame, find_joint, frame_index
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.run import Plant
-from fflin.view.page import Page, corner_points, packed, subtitle, thrusters
+from fflin.view.page import Page, packed, subtitle
 from fflin.view.panel import panel
-from fflin.view.scene import Drawing, animation, body_nodes, body_poses
+from fflin.view.scene import Drawing, animation, body_poses
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
 
-# A drawn robot with its poses (N, njoints - 1, 7).
-Moving: TypeAlias = "tuple[Drawing, Array]"
+# Number of poses in a period, and the period's duration on the screen [s]. The amplitude is
+# limited by the rotation _ANGLE [rad], and by the displacement _SHARE relative to the robot's
+# size.
+_PHASES, _PERIOD = 48, 2.0
+_ANGLE, _SHARE = 0.5, 0.14
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
@@ -74,14 +84,11 @@ def motion_page(
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
         moving.append((page.draw(robot, "linear", "linear"), poses))
-    held = {
-        caught.prefix: (
-            page.draw(caught.payload, f"held/{caught.prefix}", "held", caught.prefix),
-            at,
-        )
-        for caught, at in payloads(motion, frame, shown)
-    }
-    moving += held.values()
+    held = []
+    for caught, poses in payloads(motion, frame, shown):
+        name = caught.prefix
+        held.append((page.draw(caught.payload, f"held/{name}", "held", name), poses))
+    moving += held
     clips = []
     for each, poses in moving:
         each.place(poses[0])
@@ -93,30 +100,29 @@ def motion_page(
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
-    page.set_stage(film.poses[0], about[0], [each for each, _ in held.values()])
-    size = page.size
-    corners = [frame_points(drawing, film, size)]
-    for each, rows in ((drawing, goals), *held.values()):
-        corners += [corner_points(each, poses) for poses in rows[:: max(1, len(rows) // 24)]]
+    page.set_stage(film.poses[0], about[0], [each for each, _ in held])
+    corners = [frame_points(page, film)]
+    for each, rows in ((drawing, goals), *held):
+        corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
     points = np.concatenate(corners)
     page.floor[2] = float(points[:, 2].min())
     if follow is None:
         # If the whole of a long path were in view, the robot would be only a dot.
-        follow = bool(np.ptp(points, axis=0).max() > _FAR * size)
+        follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
-        points = frame_points(drawing, film, size, follow=True)
+        points = frame_points(page, film, follow=True)
     html = page.html(
         "motion",
         points,
         **panel(robot, motion, shown, goal),
-        **marks(robot, film, tool, size, goals[:1] if motion.phases else goals),
+        **marks(page, film, goals[:1] if motion.phases else goals),
         t=packed(t),
         speed=speed,
         follow=follow,
         target=len(goals) > 0,
         linear=motion.linear is not None,
         phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
-        held=list(held),
+        held=[each.prefix for each, _ in held],
     )
     drawn = [drawing, *(each for each, _ in moving[1:] if each.robot.urdf)]
     return html, tuple(dict.fromkeys(note for each in drawn for note in each.notes))
@@ -129,34 +135,32 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
-def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
+def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: body corners and force tips."""
     chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:
         base = film.poses[index, 0, :3]
-        tip = base + ARROW * size * film.force[index] / strongest
+        tip = base + ARROW * page.size * film.force[index] / strongest
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
-        points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
+        points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
     return np.concatenate(points)
 
 
-def marks(
-    robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
-) -> dict[str, object]:
+def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
     trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
     if len(goals) > 1:
         trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
-    if tool:
+    if page.tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
         if followed:
-            joint, at = find_frame(robot.model, tool)
+            joint, at = find_frame(page.robot.model, page.tool)
             ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
             followed["tool"] = np.array(ends)
     arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
-    nodes = body_nodes(robot)
+    size = page.size
     most = float(np.abs(film.thrust).max(initial=0.0))
     return {
         "trails": [
@@ -179,15 +183,8 @@ def marks(
             if np.any(values)
         ],
         "plumes": [
-            {
-                "path": nodes[joint - ROOT],
-                "position": position.tolist(),
-                "direction": direction.tolist(),
-                "values": packed(film.thrust[:, k]),
-                "most": most,
-                "name": name,
-            }
-            for k, (name, joint, position, direction) in enumerate(thrusters(robot))
+            {**nozzle, "values": packed(film.thrust[:, k]), "most": most, "name": name}
+            for k, (name, nozzle) in enumerate(page.nozzles)
             if most
         ],
     }
@@ -284,3 +281,84 @@ def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
         pin.forwardKinematics(model, data, q)
         poses.append(np.array([pin.SE3ToXYZQUAT(data.oMi[joint] * at) for joint, at in places]))
     return poses
+
+
+def mode_page(
+    robot: Robot, found: Modes, *, scene: str, tool: str | None
+) -> tuple[str, tuple[str, ...]]:
+    """Return the page of a robot's modes, and notes about missing drawings; see `visualize`."""
+    lin = found.lin
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
+        raise InputError(
+            f"the modes belong to a model of '{lin.robot}' with {len(lin.state_names)} states, "
+            f"expected the {state.nx} states of '{robot.name}'; give the robot and the modes of "
+            "the same unreduced model"
+        )
+    if not found.vibrations:
+        raise InputError(
+            f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
+            "joints a stiffness"
+        )
+    page = Page(robot, scene, tool, lin.frame)
+    at_rest = body_poses(robot, robot.model.createData(), lin.q)
+    page.drawing.place(at_rest)
+    page.draw(robot, "rest", "ghost").place(at_rest)
+    page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
+    swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
+    energies = energies_of(robot, lin, [mode.shape for mode in found.vibrations])
+    points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
+    modes = [
+        {
+            "frequency": mode.frequency,
+            "damping": mode.damping_ratio,
+            "unstable": bool(mode.unstable),
+            "energy": list(energy.items())[:2],
+            "shape": _shape(mode, lin),
+            "poses": packed(poses),
+        }
+        for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
+    ]
+    corners = np.concatenate(points)
+    html = page.html("modes", corners, period=_PERIOD, bodies=page.nodes, modes=modes)
+    return html, page.drawing.notes
+
+
+def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
+    """Return poses (_PHASES, njoints - 1, 7) over a period of x0 + Re(a shape exp(i phase))."""
+    robot, half = state.robot, len(lin.x0) // 2
+    data = robot.model.createData()
+
+    def poses(amplitude: float) -> Array:
+        found = []
+        for phase in np.arange(_PHASES) * (2.0 * math.pi / _PHASES):
+            x = lin.x0.copy()
+            x[:half] += amplitude * (mode.shape[:half] * np.exp(1j * phase)).real
+            found.append(body_poses(robot, data, state.to_pinocchio(x)[0]))
+        return np.array(found)
+
+    # Displacement of the corners per unit amplitude, computed with a small amplitude.
+    small = 1e-4
+    rest = drawing.points(body_poses(robot, data, lin.q))
+    moved = np.array([drawing.points(each) - rest for each in poses(small)])
+    reach = float(np.linalg.norm(moved, axis=2).max()) / small
+    turned = np.abs(mode.shape[:half]) * [
+        {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]
+    ]
+    most = [_ANGLE / turned.max()] if turned.any() else []
+    most += [_SHARE * size / reach] if reach else []
+    return poses(min(most, default=0.0))
+
+
+def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
+    """Return name, unit, amplitude and phase [deg] of the positions with the largest amplitude.
+
+    The largest amplitude is 1.
+    """
+    sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
+    order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()
+    return [
+        (lin.state_names[i], lin.state_units[i], float(sizes[i]), float(phases[i]))
+        for i in order
+        if sizes[i] > 0.01
+    ]
