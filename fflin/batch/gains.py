@@ -15,7 +15,7 @@ from fflin.base.validation import Array, instance, vector
 from fflin.batch.configurations import column, positions
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
-from fflin.control.lqr import lqr, near_boundary
+from fflin.control.lqr import lqr
 from fflin.control.optimal.riccati import half_size
 from fflin.control.policies import Feedback, Policy
 from fflin.control.weights import weight
@@ -184,7 +184,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     for index, L in enumerate(batch.B_lower):
         B = np.concatenate((np.zeros_like(L), L))
         found = half_size(batch.A[0], B, Q, R) if direct else None
-        if found is not None and not near_boundary(found.poles, 0.0):
+        if found is not None:
             K[index], residual[index] = found.K, found.residual
             margin[index] = -found.poles.real.max()
             continue

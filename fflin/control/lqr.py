@@ -17,7 +17,7 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.validation import Array, Values, dimension, instance
+from fflin.base.validation import Array, dimension, instance
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
 from fflin.control.weights import Weight, cost_weights, rule_weights, weight
@@ -25,11 +25,6 @@ from fflin.linear.model import LinearModel
 
 # A relative residual above _COARSE gives a warning; above _USELESS, the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
-
-# A pole may lie on the stability boundary if its distance from the boundary, relative to the
-# largest pole, is below this. Rounding moves the pole of a mode that Q does not weight by such a
-# distance.
-_NEAR_BOUNDARY = 1e-6
 
 
 def lqr(
@@ -293,15 +288,9 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def near_boundary(poles: Values, dt: float) -> bool:
-    """Return whether a pole of a stable loop is close to the stability boundary."""
-    decay = 1.0 - np.abs(poles) if dt else -poles.real
-    return decay.min() < _NEAR_BOUNDARY * np.abs(poles - 1.0 if dt else poles).max()
-
-
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
-    if structured is not None and not near_boundary(structured.poles, lin.dt):
+    if structured is not None:
         return structured
     # These checks name the mode that would make a general solver fail.
     require_stabilizable(lin)
@@ -310,8 +299,6 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
         toward = np.linalg.solve(R, N.T)
         free, A = _difference(Q, N, toward), _difference(A, lin.B, toward)
     require_weighed(lin, A, free)
-    if structured is not None:
-        return structured
     try:
         solution = solve(lin.A, lin.B, Q, R, N, lin.dt)
         if solution.residual > _USELESS:

@@ -104,19 +104,26 @@ def inverse_square(what: str, size: float) -> float:
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
     """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
-    size = len(names)
+    size, rounding = len(names), 0.0
     if isinstance(value, Mapping):
-        diagonal = _diagonal(what, value, names, complete=definite)
+        matrix = np.diag(_diagonal(what, value, names, complete=definite))
     elif (indices := dimension(what, value)) == 0:
-        diagonal = np.full(size, number(what, value))
+        matrix = number(what, value) * np.eye(size)
     elif indices == 1:
-        diagonal = vector(what, value, size, f"one weight for each of {names[0]} to {names[-1]}")
+        expected = f"one weight for each of {names[0]} to {names[-1]}"
+        matrix = np.diag(vector(what, value, size, expected))
     else:
-        return _checked_matrix(what, value, names, definite)
-    lowest = int(diagonal.argmin())
-    if diagonal[lowest] < 0.0 or (definite and diagonal[lowest] == 0.0):
-        raise _negative(what, float(diagonal[lowest]), names[lowest], definite)
-    return np.diag(diagonal)
+        matrix, rounding = shaped(what, value, (size, size)), _ROUNDING
+        skew = np.abs(matrix - matrix.T)
+        if skew.max() > rounding * np.abs(matrix).max():
+            i, j = np.unravel_index(int(skew.argmax()), skew.shape)
+            raise InputError(
+                f"{what} is not symmetric: {what}[{i}, {j}] is {matrix[i, j]:g} and "
+                f"{what}[{j}, {i}] is {matrix[j, i]:g}; give a symmetric matrix"
+            )
+        matrix = 0.5 * matrix + 0.5 * matrix.T
+    require_semidefinite(what, matrix, names, rounding, definite)
+    return matrix
 
 
 def columns(what: str, value: ArrayLike, rows: int) -> Array:
@@ -128,13 +135,23 @@ def columns(what: str, value: ArrayLike, rows: int) -> Array:
 
 
 def require_semidefinite(
-    what: str, matrix: Array, names: Sequence[str], definite: bool = False
+    what: str, matrix: Array, names: Sequence[str], rounding: float, definite: bool = False
 ) -> None:
-    """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite."""
-    values, directions = np.linalg.eigh(matrix)
-    if definite or values[0] < -_ROUNDING * np.abs(matrix).max(initial=0.0):
-        where = names[int(np.abs(directions[:, 0]).argmax())]
-        raise _negative(what, float(values[0]), where, definite)
+    """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite.
+
+    A negative eigenvalue that is smaller than `rounding` times the largest entry is permitted.
+    """
+    try:
+        np.linalg.cholesky(matrix)  # quicker than eigenvalues
+    except np.linalg.LinAlgError:
+        values, directions = np.linalg.eigh(matrix)
+        if definite or values[0] < -rounding * np.abs(matrix).max(initial=0.0):
+            kind = "definite" if definite else "semidefinite"
+            raise InputError(
+                f"{what} is not positive {kind}: it has the eigenvalue {values[0]:.6g} with an "
+                f"eigenvector mainly along {names[int(np.abs(directions[:, 0]).argmax())]}; "
+                "increase the weight there"
+            ) from None
 
 
 def cost_weights(
@@ -146,26 +163,9 @@ def cost_weights(
     if N is None:
         return Q, R, None
     cross = shaped("N", N, (len(Q), len(R)))
-    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), of.state_names)
+    reduced = Q - cross @ np.linalg.solve(R, cross.T)
+    require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
     return Q, R, cross
-
-
-def _checked_matrix(what: str, value: ArrayLike, names: Sequence[str], definite: bool) -> Array:
-    size = len(names)
-    matrix = shaped(what, value, (size, size))
-    skew = np.abs(matrix - matrix.T)
-    if skew.max() > _ROUNDING * np.abs(matrix).max():
-        i, j = np.unravel_index(int(skew.argmax()), skew.shape)
-        raise InputError(
-            f"{what} is not symmetric: {what}[{i}, {j}] is {matrix[i, j]:g} and {what}[{j}, {i}] "
-            f"is {matrix[j, i]:g}; give a symmetric matrix"
-        )
-    matrix = 0.5 * matrix + 0.5 * matrix.T
-    try:
-        np.linalg.cholesky(matrix)  # quicker than eigenvalues
-    except np.linalg.LinAlgError:
-        require_semidefinite(what, matrix, names, definite)
-    return matrix
 
 
 class SampledCost(NamedTuple):
@@ -255,14 +255,6 @@ def _diagonal(
             f"{what} has no value for {missing}; give a value for every entry of {what}"
         )
     return np.array([found.get(index, 0.0) for index in range(len(names))])
-
-
-def _negative(what: str, value: float, where: str, definite: bool) -> InputError:
-    kind = "definite" if definite else "semidefinite"
-    return InputError(
-        f"{what} is not positive {kind}: it has the eigenvalue {value:.6g} with an eigenvector "
-        f"mainly along {where}; increase the weight there"
-    )
 
 
 def rule_weights(

@@ -118,16 +118,9 @@ def _units(A: Array, S: Array, Q: Array) -> Array:
     return unit
 
 
-class _Interval(NamedTuple):
-    """Interval between two times, with its transitions and the coefficients at both ends."""
-
-    start: float
-    end: float
-    whole: Transition
-    early: Transition  # through the first half
-    late: Transition
-    at_start: Coefficients
-    at_end: Coefficients
+# Start and end of an interval, its transitions through the whole, the first half and the second
+# half, and the coefficients at both ends.
+_Interval = tuple[float, float, Transition, Transition, Transition, Coefficients, Coefficients]
 
 
 def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Interval]:
@@ -139,15 +132,10 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
     found = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
     early, late, ends = zip(*(np.split(x, (3 * count, 6 * count)) for x in found), strict=True)
     mapped = transition(Coefficients(*early), Coefficients(*late), h)
-    through = [Transition(*x) for x in zip(*mapped, strict=True)]
+    maps = [Transition(*x) for x in zip(*mapped, strict=True)]
     of_knots = [Coefficients(*x) for x in zip(*ends, strict=True)]
-    transitions = zip(
-        through[:count], through[count : 2 * count], through[2 * count :], strict=True
-    )
-    return [
-        _Interval(float(knots[k]), float(knots[k + 1]), *three, of_knots[k], of_knots[k + 1])
-        for k, three in enumerate(transitions)
-    ]
+    times, parts = knots.tolist(), (maps[:count], maps[count : 2 * count], maps[2 * count :])
+    return list(zip(times[:-1], times[1:], *parts, of_knots[:-1], of_knots[1:], strict=True))
 
 
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
@@ -161,16 +149,15 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
         # Intervals still to be integrated; the latest interval is the last entry.
         pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
-            interval, P = pending.pop(), values[-1]
-            start, end, middle = *interval[:2], 0.5 * (interval.start + interval.end)
-            error = math.inf
+            start, end, whole, early, late, at_start, at_end = pending.pop()
+            P, middle, error = values[-1], 0.5 * (start + end), math.inf
             # If the coefficients of a long step are indefinite, the solution fails and shorter
             # steps are tried.
             with suppress(np.linalg.LinAlgError):
-                single, half = interval.whole.back(P), interval.late.back(P)
-                double = interval.early.back(half)
+                single, half = whole.back(P), late.back(P)
+                double = early.back(half)
                 # `between` is the value of the Hermite cubic at the middle of the interval.
-                bend = interval.at_start.rate(double) - interval.at_end.rate(P)
+                bend = at_start.rate(double) - at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
                 # The error of two half steps is a sixteenth of the error of one whole step, so it
                 # is a fifteenth of their difference. To be safe, a quarter of the difference is

@@ -25,6 +25,10 @@ _NEAR = 1e-3
 
 _APART = 1e-5
 
+# A pole is near the stability boundary if its distance from the boundary, relative to the largest
+# pole, is below this. Rounding moves the pole of a mode that Q does not weight by such a distance.
+_NEAR_BOUNDARY = 1e-6
+
 
 class Solution(NamedTuple):
     """Solution of a Riccati equation: P, K, the poles of A - B K, residual and method."""
@@ -130,9 +134,16 @@ def solve(
 def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
-    """Return the solution of the half-size method, or None if the method is not accurate."""
-    solution = _half_size(Riccati(A, B, Q, R, N, dt))
-    return solution if solution is not None and solution.residual <= _SOUND else None
+    """Return the solution of the half-size method, or None if it is not certain.
+
+    The solution is not certain if it is inaccurate, or if a pole is near the stability boundary.
+    """
+    found = _half_size(Riccati(A, B, Q, R, N, dt))
+    if found is None or found.residual > _SOUND:
+        return None
+    decay = 1.0 - np.abs(found.poles) if dt else -found.poles.real
+    size = np.abs(found.poles - 1.0 if dt else found.poles).max()
+    return found if decay.min() >= _NEAR_BOUNDARY * size else None
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
