@@ -183,7 +183,7 @@ def linearize_trajectory(
     u: ArrayLike | None = None,
     *,
     strict: bool = False,
-    **options: Any,
+    **options: object,
 ) -> LinearTrajectory:
     """Linearise a robot along a motion.
 
@@ -234,8 +234,8 @@ def linearize_trajectory(
             )
         motion = t if t.robot is robot else replace(t, robot=robot)
     else:
-        arrays: Any = (t, q, v, u)
-        motion = Trajectory(robot, *arrays, **options)
+        given: dict[str, Any] = {"t": t, "q": q, "v": v, "u": u, **options}
+        motion = Trajectory(robot, **given)
     motion.require(strict=strict)
     return along(motion)
 

@@ -121,7 +121,7 @@ class Prepared:
         return frozen(pin.SE3ToXYZQUAT(self.map.reference))
 
     @property
-    def fields(self) -> dict[str, Any]:
+    def fields(self) -> dict[str, object]:
         """Fields of a model at rest except B and q; slow ones are computed at their first use."""
         asked = {
             "x0": self._state_at,

@@ -171,7 +171,7 @@ class LinearModel(StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
 
-    def __init__(self, shared: Mapping[str, Any] | None = None, /, **fields: Any) -> None:
+    def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
         # A dataclass would set three dozen frozen fields one by one, which takes as long as the
         # dynamics of a small robot. Here, most fields are in `shared` for all models of a robot.
         for name, value in fields.items():
@@ -179,7 +179,7 @@ class LinearModel(StateSpace):
                 fields[name] = frozen(value.copy())
         vars(self).update(shared or {}, **fields)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         # `shared` may hold {field: function of the model} for fields that are computed at first
         # access, because they take as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -75,15 +76,16 @@ class ToolCoordinates:
         swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular)
         # The tool's base has the displacement X y, the twist X nu and the wrench X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
-        followers = [] if own else [follower.joint for follower in robot.followers]
-        self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
+        followers = () if own else map(attrgetter("joint"), robot.followers)
+        self.joints = sorted((*robot.joints, *followers), key=attrgetter("idx_v"))
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
-        self._idx_v = [joint.idx_v for joint in self.joints]
+        self._idx_v = [*map(attrgetter("idx_v"), self.joints)]
         # Velocity in nu per unit of the tool's velocity; it differs from 1 only for Pinocchio,
         # which scales modal amplitudes.
-        scales = np.array([1.0 if kind.stored == "xyzw" and tool else j.scale for j in self.joints])
-        self._scales = scales
+        self._scales: Array = np.array([*map(attrgetter("scale"), self.joints)])
+        if tool and kind.stored == "xyzw":
+            self._scales[:] = 1.0
         self.actuation = acting = Actuation(state)
         self._wrench = wrench = acting.fixed[:6]  # wrench on the base per unit of each input
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
@@ -99,7 +101,9 @@ class ToolCoordinates:
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
             self._inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
-        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
+        self.inputs: dict[str, str] = {}
+        for i in self._inputs:
+            self.inputs[acting.names[i]] = acting.units[i]
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
@@ -211,7 +215,7 @@ class ToolCoordinates:
         if kind.attitude == "pose":
             base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
         base[k:, :3], base[k:, 6:] = by_turn, self._rotated(R, rates=kind.rates)
-        base[:k], base[k:] = (np.roll(rows, self._roll, axis=0) for rows in (base[:k], base[k:]))
+        base[:k], base[k:] = np.roll(base[:k], self._roll, 0), np.roll(base[k:], self._roll, 0)
         first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
         rows, columns = [*range(k), *range(first, first + 6)], [*range(6), *range(6 + n, 12 + n)]
