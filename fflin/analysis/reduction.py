@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -342,7 +342,7 @@ def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> Li
     """Return the model of the named states, with the inertia M and the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
-    values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
+    values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
     for key in ("output_names", "output_units"):
         values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
     return certified(LinearModel(**values), lin, make)
@@ -359,7 +359,7 @@ def outputs_of(lin: LinearModel, S: Array) -> Array:
     return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
 
 
-def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
+def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]:
     """Return the fields of the model with states z = S x and inertia M, where x = T z."""
     names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
     whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}

@@ -20,6 +20,9 @@ from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
 
+# Fields of `Pulses` that change during a run.
+COUNTS = ("left", "level", "end")
+
 
 class Saturation(NamedTuple):
     """Limits, wheels and pulses that act on the commands of a robot's inputs."""
@@ -66,32 +69,12 @@ def saturation(
             stiffness=1.0 / (mobility * dt),
         )
         within = within._replace(wheels=wheels, wheel_names=tuple(spun))
-    if pulsed and (thrusters := _pulsed(robot)):
-        return within._replace(pulses=_pulses(thrusters, high, sample * dt, dt))
-    return within
-
-
-def _pulsed(robot: Robot) -> dict[int, tuple[str, Thruster]]:
-    """Return the pulsed thrusters {index of the input: (name, thruster)}."""
-    inputs = ((name, item) for item, names in named_inputs(robot.inputs) for name in names)
-    return {
-        index: (name, item)
-        for index, (name, item) in enumerate(inputs)
-        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
-    }
-
-
-def _pulses(
-    thrusters: Mapping[int, tuple[str, Thruster]], high: Array, time: float, dt: float
-) -> Pulses:
-    """Return the pulses of thrusters {input: (name, thruster)} for samples of `time` [s].
-
-    `time` is 0 for continuous commands. An on-off thruster without a finite limit in `high` (nu,)
-    uses its own `max`.
-    """
-    at, zero = list(thrusters), np.zeros(len(thrusters))
+    if not (pulsed and (thrusters := _pulsed(robot))):
+        return within
+    at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
     least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
+    # An on-off thruster without a finite limit uses its own `max`.
     own = [item.ranges[0][1] if item.on_off else np.inf for _, item in thrusters.values()]
     most = np.where(np.isfinite(high[at]), high[at], own)
     if (short := least > most * time).any() or not time:
@@ -103,17 +86,26 @@ def _pulses(
             else "is pulsed, which needs sampled commands; give sample=, or a sampled policy"
         )
         raise InputError(f"thruster '{name}' {why}")
-    return Pulses(
+    pulses = within.pulses._replace(
         at=np.array(at),
         on_off=on_off,
         most=most,
         least=least,
         quantum=np.where(on_off, most * dt, 1.0),
-        left=zero,
-        level=zero.copy(),
-        end=zero.copy(),
         time=time,
+        **{key: np.zeros(len(at)) for key in COUNTS},
     )
+    return within._replace(pulses=pulses)
+
+
+def _pulsed(robot: Robot) -> dict[int, tuple[str, Thruster]]:
+    """Return the pulsed thrusters {index of the input: (name, thruster)}."""
+    inputs = ((name, item) for item, names in named_inputs(robot.inputs) for name in names)
+    return {
+        index: (name, item)
+        for index, (name, item) in enumerate(inputs)
+        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
+    }
 
 
 def warn_beyond(
@@ -215,10 +207,9 @@ class Channel:
         self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
         own = channel_of(limits, initial, sample, delay)
-        counts = ("left", "level", "end")  # state of a single run
         self._rules = own._replace(
             wheels=own.wheels._replace(row=np.arange(self._wheels)),
-            pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in counts}),
+            pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in COUNTS}),
         )
 
     @property

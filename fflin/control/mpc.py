@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,9 @@ from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, range_of
 from fflin.robot.robot import Robot
+
+# Weights Q, R and Qf, and the name of the rule for Q and R.
+Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST_ENTRIES = 20_000_000
@@ -154,8 +157,8 @@ def mpc(
     of = source.robot if isinstance(source, LinearModel) else source.robot.name
     ahead = Horizon((), samples, dt, lin.input_names, limited, of)
     if isinstance(source, LinearTrajectory):
-        return _along(source, ahead, Q, R, Qf, weights)
-    return _about(source, ahead, Q, R, Qf, weights)
+        return _along(source, ahead, (Q, R, Qf, weights))
+    return _about(source, ahead, (Q, R, Qf, weights))
 
 
 class _Predictive:
@@ -236,16 +239,9 @@ def _signals(of: LinearModel | LinearTrajectory, limits: object) -> Signals:
     return Signals(tuple(names[i] for i in at), at, low[at], high[at])
 
 
-def _about(
-    lin: LinearModel,
-    ahead: Horizon,
-    Q: Weight | None,
-    R: Weight | None,
-    Qf: Weight | str,
-    weights: str | None,
-) -> Mpc:
+def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
     """Return the controller about a point, with the stages of the horizon `ahead`."""
-    sampled, signals = lin.discretize(ahead.dt), ahead.signals
+    (Q, R, Qf, weights), sampled, signals = cost, lin.discretize(ahead.dt), ahead.signals
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
@@ -265,16 +261,9 @@ def _about(
     return Mpc(sampled, gain, replace(ahead, stages=tuple(stages[::-1])))
 
 
-def _along(
-    traj: LinearTrajectory,
-    ahead: Horizon,
-    Q: Weight | None,
-    R: Weight | None,
-    Qf: Weight | str,
-    weights: str | None,
-) -> TrajectoryMpc:
+def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     """Return the controller along a trajectory, with the stages of the horizon `ahead`."""
-    dt, of_stage = ahead.dt, ahead.signals.of_stage
+    (Q, R, Qf, weights), dt, of_stage = cost, ahead.dt, ahead.signals.of_stage
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
     models, end = along(traj.resampled(dt)), follows.end

@@ -48,17 +48,12 @@ ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
-def unknown_frame(frame: object) -> InputError:
-    """Build the error for an unknown velocity frame."""
-    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
-
-
 def frame_of(robot: Robot, frame: object) -> Frame:
     """Return the given or default frame; raise `InputError` if it contradicts the orbit."""
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
-        raise unknown_frame(frame)
+        raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
     if (frame in ORBITAL) != bool(robot.orbit):
         suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
         raise InputError(

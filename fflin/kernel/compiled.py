@@ -17,6 +17,7 @@ from threading import Event, Lock, RLock, Thread
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import unknown
+from fflin.base.process import Progress
 
 if TYPE_CHECKING:
     from fflin.kernel.machine_code import Compiled
@@ -113,15 +114,11 @@ def _compile_alone(
 @contextmanager
 def _seconds_shown(what: str) -> Iterator[None]:
     """Show the elapsed seconds of a compilation on a terminal."""
-    if sys.stderr is None or not sys.stderr.isatty():
-        yield
-        return
-    done, begun = Event(), time.monotonic()
+    done, begun, bar = Event(), time.monotonic(), Progress()
 
     def count() -> None:
         while not done.wait(_INTERVAL):
-            line = f"\rcompiling {what}: {time.monotonic() - begun:.0f} s "
-            print(line, end="", file=sys.stderr, flush=True)
+            bar.say(f"compiling {what}: {time.monotonic() - begun:.0f} s ")
 
     thread = Thread(target=count, daemon=True)
     thread.start()
@@ -130,7 +127,7 @@ def _seconds_shown(what: str) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
-        print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
+        bar.close()
 
 
 @contextmanager

@@ -80,18 +80,6 @@ def _combine(shares, row, rates, out):
 
 
 @inlined
-def _record(rows, row, point, reference, t):
-    """Write a row: q, nu, u, and the reference of momentum and centre of mass."""
-    at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
-    for values in (point.q, point.nu, point.u):
-        vec.copy(values, 0, rows, at, len(values))
-        at += len(values)
-    momentum, center = forward.kept_at(reference, t)
-    vec.put6(rows, at, momentum)
-    vec.put3(rows, at + 6, center)
-
-
-@inlined
 def goes_on(stop, origin, q, rates):
     """Return whether all rates are within finite bounds and the base is within the chart."""
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
@@ -104,15 +92,12 @@ def goes_on(stop, origin, q, rates):
 
 
 @inlined
-def _act(work, channel, law, robot, point, step, stage, t):
-    """Write the commanded inputs at a stage, and the acting inputs in base axes."""
-    if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-        if is_asked(channel, step):
-            command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
-            allocate(law.allocation, point, law.u)
-        transmit(channel, step, point.nu, point.u)
-    forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
-    forward.turn_held(robot, point)
+def _decide(work, channel, law, robot, point, step, stage, t):
+    """Write the commanded inputs at a stage."""
+    if is_asked(channel, step):
+        command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
+        allocate(law.allocation, point, law.u)
+    transmit(channel, step, point.nu, point.u)
 
 
 @inlined
@@ -143,7 +128,7 @@ def advance(words, clock, last, every, rows, work):
     of = _opened(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
-    h, row = method.h, 0
+    h, at = method.h, 0  # `at` is the place of the next entry in `rows`
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
@@ -153,12 +138,20 @@ def advance(words, clock, last, every, rows, work):
         vec.copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
-            _act(work, channel, law, robot, point, step, stage, t)
+            if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
+                _decide(work, channel, law, robot, point, step, stage, t)
+            forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
+            forward.turn_held(robot, point)
             if stage == 0:
                 vec.copy(point.u, 0, stages.u, 0, len(point.u))
                 if every > 0 and step % every == 0:
-                    _record(rows, row, point, kept, step * h)
-                    row += 1
+                    for values in (point.q, point.nu, point.u):
+                        vec.copy(values, 0, rows, at, len(values))
+                        at += len(values)
+                    momentum, center = forward.kept_at(kept, step * h)
+                    vec.put6(rows, at, momentum)
+                    vec.put3(rows, at + 6, center)
+                    at += 9
             forward.accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
             if of.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]

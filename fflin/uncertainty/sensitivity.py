@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -170,7 +169,7 @@ class Sensitivity:
         """Derivatives (P, nx) of f0 with respect to each parameter."""
         return self._all[4]
 
-    def poles(self, gain: Any = None) -> tuple[Array, Array]:
+    def poles(self, gain: object = None) -> tuple[Array, Array]:
         """Return the closed-loop poles (nx,) of A - B K and their derivatives (P, nx).
 
         Parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -101,10 +101,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             near = lines.get(key, [])
             least = _UNSEEN * max(map(_size, near), default=0.0)
             seen = [(each.key.partition(".")[2], each) for each in near if _size(each) > least]
-            plot = _plot(title, key[1], seen, family)
             # Plots of rates are shown only if a limit is near.
-            if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
-                plots.append(plot)
+            if any(each.near or not title.endswith("rates") for _, each in seen):
+                plots.append(_plot(title, key[1], seen, family))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
@@ -124,7 +123,7 @@ def _size(curve: Curve) -> float:
 
 def _plot(
     title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return a plot of labelled curves, with each limit that a curve comes near."""
     return {
         "title": title,

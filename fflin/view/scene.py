@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from hashlib import sha1
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -147,7 +146,7 @@ def animation(clips: Sequence[dict[str, object]]) -> dict[str, object]:
     return {"type": "set_animation", "animations": [*clips], "options": options, "path": ""}
 
 
-def typed(array: Array | Indices, kind: str = "<f4") -> Any:
+def typed(array: Array | Indices, kind: str = "<f4") -> object:
     """Pack an array so that the page decodes it as a typed array."""
     return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
 

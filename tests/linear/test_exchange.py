@@ -343,7 +343,14 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"v has shape", back, robot, "drake", q, np.zeros(3))
     refused(r"u has shape", back, robot, "drake", q, None, np.zeros(3))
     refused(r"A has shape", back, robot, "drake", q, A=np.eye(3))
-    refused(r"A has .* finite", back, robot, "drake", q, A=np.full((13 + 2 * n,) * 2, np.nan))
+    refused(
+        r"A\[0, 0\] is nan; .* finite",
+        back,
+        robot,
+        "drake",
+        q,
+        A=np.full((13 + 2 * n,) * 2, np.nan),
+    )
     q[:4] *= 1.1
     refused(r"w, x, y, z has length 1.1, expected 1", back, robot, "drake", q)
     q = lin.to("spart").q.copy()
