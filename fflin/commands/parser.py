@@ -163,13 +163,12 @@ _NAMES = many(str, "NAME")
 _ANGLES, _AXES = one(number, ("R", "P", "Y")), one(number, ("X", "Y", "Z"))
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
-_FIGURE = OutputFile((".png", ".pdf", ".svg"))
 
 # {option or ARGUMENT: form of its value}; all other options are switches.
 FORMS: dict[str, Form] = {
-    **{"ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"}},
-    **{"URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"}},
-    **{"FILE": {"dest": "file", "type": input_file, "metavar": "FILE"}},
+    "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
+    "URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"},
+    "FILE": {"dest": "file", "type": input_file, "metavar": "FILE"},
     "DISPERSIONS": {"dest": "dispersions", "type": input_file, "metavar": "DISPERSIONS"},
     **dict.fromkeys(("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS),
     **dict.fromkeys(("effort", "limit", "bryson", "qf", "goal", "within"), _PAIRS),
@@ -210,10 +209,8 @@ FORMS: dict[str, Form] = {
     "for": {"choices": ("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates")},
     "real": {"choices": ("double", "float"), "default": "double"},
     **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
-    "plot": one(_FIGURE, "FILE"),
-    "html": one(OutputFile((".html",)), "FILE"),
-    "png": one(OutputFile((".png",)), "FILE"),
-    "gif": one(OutputFile((".gif",)), "FILE"),
+    "plot": one(OutputFile((".png", ".pdf", ".svg")), "FILE"),
+    **{ending: one(OutputFile((f".{ending}",)), "FILE") for ending in ("html", "png", "gif")},
 }
 
 _REPEATABLE = " (repeatable)"

@@ -245,12 +245,12 @@ def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
 
     if (sample := arguments.sample) is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    settings: dict[str, Any] = {"weights": arguments.weights}
+    settings = {"horizon": arguments.horizon, "dt": sample, "limits": limits_of_options(arguments)}
     if given := weights_of(arguments):
         Q, R, _, _ = rule_weights(lin.discretize(sample), arguments.weights, given)
-        settings = {"Q": Q, "R": R}
-    limits = limits_of_options(arguments)
-    by = fflin.mpc(lin, horizon=arguments.horizon, dt=sample, limits=limits, **settings)
+        by = fflin.mpc(lin, Q, R, **settings)
+    else:
+        by = fflin.mpc(lin, weights=arguments.weights, **settings)
     assert isinstance(by, Mpc)  # since the model is about a point
     return by
 
