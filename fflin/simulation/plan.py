@@ -18,8 +18,8 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, number, truth, vector, whole
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
-from fflin.control.linear_controller import LinearController, closed_loop, growing
-from fflin.control.policies import StateFeedback, axes_of, bound, decider, fed_back, feedback_of
+from fflin.control.linear_controller import closed_loop, growing
+from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
 from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
@@ -353,9 +353,7 @@ def _positive(name: str, value: object) -> float:
     return time
 
 
-def time_to_settle(
-    robot: Robot, policy: StateFeedback | LinearController, q: Array, v: Array | None
-) -> float:
+def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
     """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
 
     The time is rounded up to tens of seconds.

@@ -193,34 +193,36 @@ def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
     return settled > (1.0 - DWELL) * count
 
 
-class ErrorHistory(NamedTuple):
-    """History (N,) of the size of one kind of error."""
+class ErrorSize(NamedTuple):
+    """Size of one kind of error at the start, at most and at the end of a motion."""
 
     title: str
     unit: str
-    size: Array
+    initial: float
+    largest: float
+    final: float
+    settled: float | None  # time [s] from which the error is settled; None if too late or never
     steered: bool  # whether the policy feeds the error back
-    settled: int  # first row from which the error is settled; N if it has not settled
-    late: bool  # whether the error settles too late or not at all
 
     @property
     def last(self) -> str:
         """Title, final value and unit, for a sentence."""
-        return f"{self.title}\u00a0{self.size[-1]:.2g}\u00a0{self.unit}"
+        return f"{self.title}\u00a0{self.final:.2g}\u00a0{self.unit}"
 
-    def row(self, t: Array) -> list[str]:
-        """Return the row of this error in the table."""
-        cells = _cells(self.size[0], self.size.max(), self.size[-1])
-        not_yet = "not yet" if self.steered else "not controlled"
-        when = not_yet if self.late else f"{t[self.settled]:.3g}"
-        return [self.title, self.unit, *cells, "." if self.size.max() <= THERE else when]
+    @property
+    def row(self) -> list[str]:
+        """Row of this error in the table."""
+        when = "not yet" if self.steered else "not controlled"
+        if self.settled is not None:
+            when = f"{self.settled:.3g}" if self.largest > THERE else "."
+        return [self.title, self.unit, *_cells(self.initial, self.largest, self.final), when]
 
 
 def _cells(*values: float) -> list[str]:
     return ["." if value < _NOTHING else f"{value:.3g}" for value in values]
 
 
-def error_histories(motion: Motion) -> list[ErrorHistory]:
+def error_sizes(motion: Motion) -> list[ErrorSize]:
     """Return the errors of each kind, or an empty list without a target.
 
     Wheel speeds and modes have their own kinds. Wheel angles are left out.
@@ -243,9 +245,9 @@ def error_histories(motion: Motion) -> list[ErrorHistory]:
         size = motion.attitude_error if title == "attitude" else sizes[:, of].max(axis=1)
         fed_back = any(motion.state_names[i] in steered for i in of)
         fed_back &= title not in ("position", "v_b") or pushed(motion)
-        settled = int(settled_at(size))
-        late = bool(is_late(settled, len(size)))
-        found.append(ErrorHistory(title, unit, size, fed_back, settled, late))
+        at = int(settled_at(size))
+        settled = None if is_late(at, len(size)) else motion.t[at]
+        found.append(ErrorSize(title, unit, size[0], size.max(), size[-1], settled, fed_back))
     return found
 
 
@@ -256,7 +258,7 @@ def pushed(of: object) -> bool:
 
 def motion_report(motion: Motion) -> str:
     """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
-    kinds, t = error_histories(motion), motion.t
+    kinds, t = error_sizes(motion), motion.t
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
     head.append(f"{motion.robot}: {t[-1]:g} s, {len(t)} rows, frame {motion.frame}{by}")
@@ -264,13 +266,13 @@ def motion_report(motion: Motion) -> str:
     if kinds:
         rows = [["error", "unit", "initial", "largest", "final"]]
         rows[0].append(f"settles to {100.0 * SETTLED:g} % at [s]")
-        rows += [kind.row(t) for kind in kinds]
+        rows += [kind.row for kind in kinds]
         parts.append(f"\n{grid(rows, 'll')}\n")
     elif not motion.target.size:
         rows = [["change from the start", "unit", "largest", "final"]]
-        for kind in error_histories(replace(motion, target=motion.x[0])):
+        for kind in error_sizes(replace(motion, target=motion.x[0])):
             if kind.title in (*_PLACES, *_OF_MODES["q_m"]):
-                rows.append([kind.title, kind.unit, *_cells(kind.size.max(), kind.size[-1])])
+                rows.append([kind.title, kind.unit, *_cells(kind.largest, kind.final)])
         parts.append(f"\n{grid(rows, 'll')}\n")
     if motion.modes:
         parts.append(_largest_modes(motion))
@@ -304,15 +306,9 @@ def motion_record(motion: Motion) -> dict[str, object]:
     """Return the numbers of the report by name."""
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
+    columns = ErrorSize._fields[1:6]
     errors = {
-        each.title: {
-            "unit": each.unit,
-            "initial": each.size[0],
-            "largest": each.size.max(),
-            "final": each.size[-1],
-            "settled": None if each.late else t[each.settled],
-        }
-        for each in error_histories(motion)
+        each.title: dict(zip(columns, each[1:6], strict=True)) for each in error_sizes(motion)
     }
     return {
         **{name: getattr(motion, name) for name in own},
@@ -349,7 +345,7 @@ def _phases(motion: Motion) -> list[list[str]]:
     return table
 
 
-def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
+def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     """Return one line: whether a motion settled at its target, and if not, why."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
@@ -357,16 +353,16 @@ def verdict(motion: Motion, kinds: list[ErrorHistory]) -> str:
     judged = [kind for kind in places if kind.steered] or [
         kind for kind in kinds if kind.steered and kind.title not in _ALL_OF_MODES
     ]
-    moved = [kind for kind in judged if kind.size.max() > THERE]
-    aside = [kind.last for kind in places if kind.late and not kind.steered]
+    moved = [kind for kind in judged if kind.largest > THERE]
+    aside = [kind.last for kind in places if kind.settled is None and not kind.steered]
     if motion.tracked and not motion.phases:
         said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
-    elif failed := [kind.last for kind in moved if kind.late]:
+    elif failed := [kind.last for kind in moved if kind.settled is None]:
         said = f"not settled: {_and(failed)} off target"
     elif moved:
-        when = motion.t[max(kind.settled for kind in moved)]
+        when = max(kind.settled or 0.0 for kind in moved)
         said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
-        if late := [kind.last for kind in kinds if kind.late and kind.steered]:
+        if late := [kind.last for kind in kinds if kind.settled is None and kind.steered]:
             what = "positions" if judged[0].title in _PLACES else "rates"
             said = f"{what} {said}; not yet settled: {_and(late)}"
     else:

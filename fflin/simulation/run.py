@@ -73,18 +73,10 @@ class Plant:
             turn=np.tile(np.eye(3).ravel(), len(self.triads)),
         )
         self._faulty = faults is not None
-        self._columns = np.column_stack(
-            [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
-        )
+        self._columns = state.lift(self.actuation.fixed)
         # Whether only u acts on the robot, with a constant input matrix.
-        self._plain = (
-            state.S is None
-            and not self.actuation.carried
-            and not robot.stored_momentum
-            and not any(values.any() for values in robot.springs)
-            and not any(robot.gravity)
-            and not robot.orbit
-        )
+        others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
+        self._plain = state.S is None and not self.actuation.carried and not any(others)
         self.field = self._aba.field
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.report import influences, worst_runs
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.statistics import KINDS
-from fflin.simulation.report import error_histories
+from fflin.simulation.report import error_sizes
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
 from tests.support.messages import any_wording, says
@@ -520,11 +520,11 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        made = {each.title: each for each in error_histories(motion)}
+        made = {each.title: each for each in error_sizes(motion)}
         # A motion and a campaign call the kinds of error by the same names.
         assert [*made] == [*KINDS]
         for title, course in made.items():
-            when = np.inf if course.late else motion.t[course.settled]
+            when = np.inf if course.settled is None else course.settled
             found = campaign.values(f"settle {title}")[run]
             assert found == pytest.approx(when, rel=1e-12), title
     for former, name in (("turning", "omega_b"), ("moving", "v_b"), ("rates", "joint rates")):
