@@ -327,8 +327,7 @@ class Motion(Design):
 
 def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
-    found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
-    return found
+    return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
 
 
 def plot_motion(

@@ -116,13 +116,13 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     elif isinstance(policy, StateFeedback | Gridded):
         law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx))
         x0 = policy.lin.x0
+        direct, grid = law.filter, law.grid
         if isinstance(policy, StateFeedback):
             K, offset, x0 = policy.terms(state)
-            direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
-            law = law._replace(filter=direct)
+            direct = direct._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
         else:
-            law = law._replace(grid=_grid(policy, state.robot.joint_names))
-        law = law._replace(near=x0[state.groups.q_m].copy())
+            grid = _grid(policy, state.robot.joint_names)
+        law = law._replace(filter=direct, grid=grid, near=x0[state.groups.q_m].copy())
     size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 

@@ -73,8 +73,7 @@ class Curve(NamedTuple):
     @property
     def levels(self) -> list[float]:
         """Finite limits."""
-        levels: list[float] = self.limits[np.isfinite(self.limits)].tolist()
-        return levels
+        return [level for level in self.limits.tolist() if np.isfinite(level)]
 
     @property
     def near(self) -> list[float]:
