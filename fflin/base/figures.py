@@ -79,4 +79,6 @@ def require_matplotlib() -> None:
         optional_package("matplotlib", "figures need matplotlib", "plot")
     except ValueError as error:  # invalid MPLBACKEND or settings file
         said = str(error).partition(";")[0]
-        raise MissingPackageError(f"matplotlib fails: {said}; correct MPLBACKEND") from None
+        raise MissingPackageError(
+            f"matplotlib cannot be loaded: {said}; correct MPLBACKEND"
+        ) from None

@@ -13,7 +13,7 @@ from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, Mask
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import carrier
-from fflin.robot.fields import limits_of
+from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
 
@@ -150,8 +150,6 @@ def wheel_momentum(robot: Robot, q: Array, v: Array) -> WheelMomentum:
 
 def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:
     """Return the authority of the thrusters about a centre of mass (3,)."""
-    from fflin.control.channel import input_limits
-
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
     count = len(thrusters)

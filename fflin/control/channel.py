@@ -9,15 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
 from fflin.kernel import channel as rules
 from fflin.kernel.arguments import empty
 from fflin.kernel.channel import PULSES, WHEELS, Pulses, Wheels
-from fflin.robot.fields import Range
-from fflin.robot.inputs import Thruster, named_inputs
+from fflin.robot.fields import Range, input_limits, pulsed_thrusters
+from fflin.robot.inputs import named_inputs
 from fflin.robot.robot import Robot
 
 # Fields of `Pulses` that change during a run.
@@ -32,16 +31,6 @@ class Saturation(NamedTuple):
     wheels: Wheels = empty(WHEELS)
     wheel_names: tuple[str, ...] = ()  # in the order of `wheels`
     pulses: Pulses = empty(PULSES)
-
-
-def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
-    """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
-    inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
-    low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
-    low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
-    for index, (_, item) in _pulsed(robot).items():
-        high[index] = min(high[index], item.max or math.inf)
-    return low, high
 
 
 def saturation(
@@ -69,7 +58,7 @@ def saturation(
             stiffness=1.0 / (mobility * dt),
         )
         within = within._replace(wheels=wheels, wheel_names=tuple(spun))
-    if not (pulsed and (thrusters := _pulsed(robot))):
+    if not (pulsed and (thrusters := pulsed_thrusters(robot))):
         return within
     at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
@@ -98,16 +87,6 @@ def saturation(
     return within._replace(pulses=pulses)
 
 
-def _pulsed(robot: Robot) -> dict[int, tuple[str, Thruster]]:
-    """Return the pulsed thrusters {index of the input: (name, thruster)}."""
-    inputs = ((name, item) for item, names in named_inputs(robot.inputs) for name in names)
-    return {
-        index: (name, item)
-        for index, (name, item) in enumerate(inputs)
-        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
-    }
-
-
 def warn_beyond(
     robot: str, where: str, units: Mapping[str, str], asked: Array, low: Array, high: Array
 ) -> None:
@@ -131,7 +110,7 @@ class Law:
 
     def __init__(
         self,
-        policy: Callable[[float, Array, Array], ArrayLike],
+        policy: Callable[[float, Array, Array], object],
         names: tuple[str, ...],
         limits: tuple[Array, Array],
         slow: float,

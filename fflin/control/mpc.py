@@ -15,7 +15,6 @@ from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, Indices, Mask, instance, number, vector, whole
-from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
@@ -26,7 +25,7 @@ from fflin.control.weights import Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import chosen_limits, range_of
+from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
 # Weights Q, R and Qf, and the name of the rule for Q and R.

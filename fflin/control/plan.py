@@ -15,7 +15,6 @@ from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
 from fflin.base.validation import Array, Mask, number, whole
-from fflin.control.channel import input_limits
 from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
@@ -24,7 +23,7 @@ from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
-from fflin.robot.fields import chosen_limits
+from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
 from fflin.robot.robot import Robot
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, frozen, instance, shaped, vector
-from fflin.control.channel import Law, input_limits
+from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
@@ -19,7 +19,7 @@ from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import limits_of
+from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 

@@ -14,7 +14,6 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
-from fflin.control.channel import input_limits
 from fflin.control.gain import Gain
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
@@ -26,7 +25,7 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import Signals, require_same, sensed
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import chosen_limits
+from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.inputs import named_inputs
 from fflin.robot.loading import load
 from fflin.robot.robot import Robot

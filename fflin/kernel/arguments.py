@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.kernel.tree import work_space
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class Kind(NamedTuple):

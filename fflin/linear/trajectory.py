@@ -17,7 +17,7 @@ from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, as_double, frozen, number, vector
+from fflin.base.validation import Array, Indices, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
@@ -117,8 +117,9 @@ class Trajectory(Design):
     _note: str = field(default="", kw_only=True)  # note printed below; not saved in files
 
     def __post_init__(self) -> None:
-        refuse_orbit(self.robot, "trajectories")
-        robot, nu = self.robot, len(self.actuation.names)
+        robot = instance("robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one")
+        refuse_orbit(robot, "trajectories")
+        nu = len(self.actuation.names)
         times = vector("t", as_double("t", self.t), np.size(self.t), "times of the knots")
         count = len(times)
         if count < 2:

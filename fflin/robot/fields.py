@@ -8,14 +8,17 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
-from fflin.base.validation import dimension, number, numbers
+from fflin.base.validation import Array, dimension, number, numbers
 from fflin.robot import inputs as kinds
 from fflin.robot.inputs import (
     Input,
     JointTorque,
     ReactionWheel,
+    Thruster,
     named_inputs,
     named_wheels,
     three_numbers,
@@ -112,7 +115,9 @@ def _coefficients(what: str, value: object, robot: Robot) -> dict[str, float]:
     """Return the stiffness or damping {joint: value} from a mapping, one value or "urdf"."""
     if isinstance(value, str) and what == "damping":
         if value != "urdf":
-            raise InputError(f"damping is '{value}', expected 'urdf', a number or {{joint: d}}")
+            raise InputError(
+                f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}"
+            )
         return dict(robot.urdf_damping)
     many = value if isinstance(value, Mapping) else dict.fromkeys(robot.own_joints, value)
     found = _of_joints(what, many, robot)
@@ -231,6 +236,26 @@ def limits_of(robot: Robot) -> dict[str, Range]:
     known = {*found, *state_keys(robot.joint_names)}
     found |= {name: limits for name, limits in robot.limits.items() if name in known}
     return {name: limits for name, limits in found.items() if limits != _OPEN}
+
+
+def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
+    """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
+    inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
+    low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
+    low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
+    for index, (_, item) in pulsed_thrusters(robot).items():
+        high[index] = min(high[index], item.max or math.inf)
+    return low, high
+
+
+def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
+    """Return the pulsed thrusters {index of the input: (name, thruster)}."""
+    inputs = ((name, item) for item, names in named_inputs(robot.inputs) for name in names)
+    return {
+        index: (name, item)
+        for index, (name, item) in enumerate(inputs)
+        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
+    }
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias, cast
 
 import numpy as np
 
@@ -301,10 +301,9 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 def three_numbers(what: str, value: object) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` with the given value."""
-    entries = value if isinstance(value, Iterable) else ()
     try:
-        x, y, z = (number(what, entry) for entry in entries)
-    except ValueError:
+        x, y, z = (number(what, entry) for entry in cast("Iterable[object]", value))
+    except (TypeError, ValueError):
         raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
     return x, y, z
 

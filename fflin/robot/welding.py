@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -93,7 +93,10 @@ def locked_model(
 
 def requested(lock: object) -> dict[str, float | None]:
     """Return locks as {joint or pattern: value}; the value None means the neutral position."""
-    names = [lock] if isinstance(lock, str) or not isinstance(lock, Iterable) else [*lock]
+    try:
+        names: list[object] = [lock] if isinstance(lock, str) else [*cast("Iterable[object]", lock)]
+    except TypeError:  # not iterable
+        names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
     return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(map(str, names))

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
-from fflin.control.channel import channel_of, input_limits
+from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, decider, measured_at
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
@@ -15,7 +15,7 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.arguments import empty
 from fflin.kernel.tree import batch_tree
-from fflin.robot.fields import limits_of
+from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan
 from fflin.simulation.run import Plant

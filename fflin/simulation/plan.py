@@ -143,12 +143,15 @@ class Plan:
         _require_room(times, state, chosen=options.dt is None)
         expected = "a list of functions event(t, q, v)"
         self.events = tuple(instance("events", options.events, Sequence, expected))
-        for each in (*self.events, options.callback, options.disturbance):
-            if not (each is None or callable(each)):
-                raise InputError(
-                    f"an event, the callback or the disturbance has type {type(each).__name__}, "
-                    "expected a function of (t, q, v), and of (t, q, v, u) for the callback"
-                )
+        functions: list[tuple[str, object, str]] = [("event", x, "(t, q, v)") for x in self.events]
+        if options.callback is not None:
+            functions.append(("callback", options.callback, "(t, q, v, u)"))
+        if options.disturbance is not None:
+            functions.append(("disturbance", options.disturbance, "(t, q, v)"))
+        for name, given, arguments in functions:
+            if not callable(given):
+                kind = type(given).__name__
+                raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
         # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
         acting, self.known = chosen_limits(robot, options.limits)
         self.limits = saturation(

@@ -37,10 +37,13 @@ def test_of_all_that_do_the_same_it_is_the_least():
 
 def test_an_input_that_leaves_its_bound_adds_one_column_to_the_factor(monkeypatch):
     added = []
-    whole = allocation._orthogonalise
-    monkeypatch.setattr(
-        allocation, "_orthogonalise", lambda *given: added.append(given[2]) or whole(*given)
-    )
+    fit = allocation._fit
+
+    def noted(problem, size, free, kept):
+        added.extend(range(kept, free))
+        fit(problem, size, free, kept)
+
+    monkeypatch.setattr(allocation, "_fit", noted)
     wanted = np.arange(1.0, 7.0)  # the last thruster leaves its bound first
     u = nearest(np.eye(6), wanted, np.zeros(6), np.full(6, np.inf))
     assert u == pytest.approx(wanted, rel=1e-12)

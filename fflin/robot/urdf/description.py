@@ -177,7 +177,9 @@ def read_joint(element: Element) -> JointElement:
         joint = joint._replace(axis=found.vector("xyz", 3))
         length = math.hypot(*joint.axis)
         if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
-            raise found.error(f"{found.title} has length {length:g}, expected a direction as 0 0 1")
+            raise found.error(
+                f"{found.title} has length {length:g}, expected a direction such as 0 0 1"
+            )
     if found := element.find("dynamics", "damping", "friction"):
         damping, friction = (found.number(x, 0.0) for x in ("damping", "friction"))
         if min(damping, friction) < 0.0:

@@ -93,7 +93,9 @@ class Element:
                         f"{child.title} has an unknown attribute {quoted(name)}; known: "
                         f"{', '.join(attributes)}; correct it or remove it"
                     )
-                child.note(f"attribute {quoted(name)} of <{tag}> is not in URDF and ignored")
+                child.note(
+                    f"attribute {quoted(name)} of <{tag}> is not part of URDF, and is ignored"
+                )
         return found[0] if found else None
 
     def require(self, tag: str, *attributes: str) -> Element:
