@@ -6,7 +6,6 @@ import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -21,9 +20,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
 # counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.

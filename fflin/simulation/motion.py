@@ -19,15 +19,14 @@ from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors,
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
+from fflin.linear.trajectory import Trajectory, along
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
+from fflin.robot.robot import Robot
 from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from fflin.linear.trajectory import Trajectory
-    from fflin.robot.robot import Robot
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -273,7 +272,36 @@ class Motion(Design):
                 "a motion that was read from a file lacks its robot; join motions returned by "
                 "simulate"
             )
-        return _joined(parts[0], parts)
+        first = parts[0]
+        whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
+        robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
+        for part in parts[1:]:
+            if isinstance(part, Impact):
+                name, (other, other_q, other_v) = part.event, part._before
+            else:
+                instance("a phase", part, Motion, "a Motion, or an Impact before one")
+                name, other, other_q, other_v = (
+                    event or part.robot,
+                    part._robot,
+                    part.q[0],
+                    part.v[0],
+                )
+            seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
+            apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
+            if apart.max() > _MET * max(1.0, np.abs(v).max()):
+                at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
+                raise InputError(
+                    f"'{name}' does not begin where the motion before it ended: "
+                    f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
+                    "start from q and v in the last row of that motion"
+                )
+            if isinstance(part, Impact):
+                robot, q, v, event = part.robot, part.q, part.v, part.event
+                whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
+            else:
+                robot, q, v, event = other, part.q[-1], part.v[-1], ""
+                whole = _longer(whole, part, name)
+        return whole
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory, which can be linearised or tracked.
@@ -283,8 +311,6 @@ class Motion(Design):
         extrapolated, because they are not recorded. `robot` is required only if the motion was read
         from a file.
         """
-        from fflin.linear.trajectory import along
-
         return along(self, robot or self._robot)
 
     @property
@@ -371,34 +397,6 @@ def plot_motion(
     from fflin.simulation.plots import draw_motion
 
     return draw_motion(require_motion(motion), path, show)
-
-
-def _joined(first: Motion, parts: tuple[Motion | Impact, ...]) -> Motion:
-    """Join the parts of a motion, motions and impacts; `first` is the first part."""
-    whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
-    robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
-    for part in parts[1:]:
-        if isinstance(part, Impact):
-            name, (other, other_q, other_v) = part.event, part._before
-        else:
-            instance("a phase", part, Motion, "a Motion, or an Impact before one")
-            name, other, other_q, other_v = event or part.robot, part._robot, part.q[0], part.v[0]
-        seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
-        apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
-        if apart.max() > _MET * max(1.0, np.abs(v).max()):
-            at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
-            raise InputError(
-                f"'{name}' does not begin where the motion before it ended: "
-                f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
-                "start from q and v in the last row of that motion"
-            )
-        if isinstance(part, Impact):
-            robot, q, v, event = part.robot, part.q, part.v, part.event
-            whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
-        else:
-            robot, q, v, event = other, part.q[-1], part.v[-1], ""
-            whole = _longer(whole, part, name)
-    return whole
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
