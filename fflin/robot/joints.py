@@ -94,10 +94,6 @@ class Follower(NamedTuple):
     multiplier: float
     offset: float
 
-    def place(self, q: Array) -> None:
-        """Write the mimic joint's value, which follows from its leader's value, into q (nq,)."""
-        self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
-
     def within(self, model: pin.Model) -> Follower:
         """Return this mimic joint with the indices of its joints in another model."""
         return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
@@ -186,14 +182,13 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        for follower in self.followers:
-            follower.place(q)
+        self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:
         """Write the values of mimic joints, which follow their leaders, into q (nq,)."""
-        for follower in self.followers:
-            follower.place(q)
+        for joint, leader, multiplier, offset in self.followers:
+            joint.place(q, multiplier * leader.value(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""

@@ -368,24 +368,17 @@ class Robot(Coordinates):
                 return changed
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
-    @cached_property
+    @property
     def pieces(self) -> dict[str, Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        # Wheels are inserted between the joints, so the joints' indices differ from the bare
-        # robot's.
-        names, at = self._bare.model.names, self.model.getJointId
-        now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
-        found = self._links_and_bodies[0]
-        return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
+        return self._links_and_bodies[0]
 
     @property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
         return self._links_and_bodies[1]
 
-    @cached_property
-    def _links_and_bodies(self) -> tuple[dict[str, Piece], dict[str, str]]:
-        return pieces_of(self._bare.model, self.links)
+    _links_and_bodies = cached_property(pieces_of)
 
     @property
     def used_frames(self) -> tuple[str, ...]:
