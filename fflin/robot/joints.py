@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
@@ -143,15 +144,19 @@ def find_joint(model: pin.Model, name: str) -> Carried:
     return Carried(frame.parentJoint, pin.SE3(frame.placement))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Coordinates:
     """Configuration q and velocity v of a robot, and checks of given values."""
 
     model: pin.Model
     name: str
     joints: tuple[Joint, ...]
-    followers: tuple[Follower, ...]
-    _as_made: tuple[pin.Model, pin.Model] | None
-    _removed: tuple[str, ...]
+    followers: tuple[Follower, ...] = ()
+    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
+    _removed: tuple[str, ...] = ()
+    # The model, and a copy of it. The copy shows whether the model has changed since it was
+    # copied.
+    _as_made: tuple[pin.Model, pin.Model] | None = None
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

@@ -245,7 +245,7 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
             f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA gives "
             "wrong results; add all joints of one branch before the joints of the next branch"
         )
-    return Robot(model, name, None, "", joints, followers, locked=locked)
+    return Robot(model, name, joints, followers, locked=locked)
 
 
 def _check_model(model: pin.Model, name: str) -> None:

@@ -11,7 +11,7 @@ physically-consistent inertial parameter identification, IEEE Robotics and Autom
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -118,7 +118,7 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
             density, com = checked["mass"] * drawn[:, 0], checked["com"] * drawn[:, 1:4] * radii
             wider = checked["inertia"] * drawn[:, 4:]
-            mass, com, about = _properties(_stretched(body, np.eye(3), density, com, wider))
+            mass, com, about = properties(_stretched(body, np.eye(3), density, com, wider))
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
 
@@ -144,7 +144,7 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     return (1.0 + density)[:, None, None] * (T @ P @ T.swapaxes(1, 2))
 
 
-def _properties(P: Array) -> tuple[Array, Array, Array]:
+def properties(P: Array) -> tuple[Array, Array, Array]:
     """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of pseudo-inertias (N, 4, 4)."""
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
@@ -239,11 +239,6 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     center = np.concatenate((body.lever + com @ piece.frame.rotation.T, np.ones((len(com), 1))), 1)
     added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
     return after + added - body.toPseudoInertia().toMatrix()
-
-
-def with_changed(body: pin.Inertia, changes: Iterable[Array]) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body with changed links."""
-    return _properties(body.toPseudoInertia().toMatrix() + sum(changes))
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from fflin.robot.equipment.assembly import equipped, with_appendages
 from fflin.robot.equipment.mounting import stored_momentum
 from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
-from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
+from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
 from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
@@ -122,12 +122,8 @@ class Robot(Coordinates):
     (3, 50.0, 972)
     """
 
-    model: pin.Model
-    name: str
-    urdf: Path | None
-    urdf_sha256: str
-    joints: tuple[Joint, ...]
-    followers: tuple[Follower, ...] = ()
+    urdf: Path | None = None
+    urdf_sha256: str = ""
     notes: tuple[str, ...] = ()
     locked: tuple[str, ...] = ()
     urdf_damping: Mapping[str, float] = field(default_factory=dict)
@@ -151,11 +147,6 @@ class Robot(Coordinates):
     appendages: tuple[Appendage, ...] = ()
     # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
-    _removed: tuple[str, ...] = ()
-    # The model, and a copy of it. The copy shows whether the model has changed since it was
-    # copied.
-    _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
         if self._as_made is None or self._as_made[0] is not self.model:
