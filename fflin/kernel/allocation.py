@@ -20,7 +20,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import INDICES, LANED, Struct, empty
 from fflin.kernel.bodies import factorise, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
-from fflin.kernel.lanes import called, inlined, load, root, store
+from fflin.kernel.lanes import called, load, root, store
 
 # Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
 # smallest.
@@ -75,7 +75,6 @@ def least_squares(least, most, size):
     )
 
 
-@inlined
 def half_solve(work, tree, x, first):
     """Replace the force f at x by D^-1/2 L^-T f.
 
@@ -89,7 +88,6 @@ def half_solve(work, tree, x, first):
         store(x, first + k, value * root(load(work, tree.scaled + row + tree.depth[k])))
 
 
-@inlined
 def allocate(allocation, point, commanded):
     """Write a command into the inputs, after allocation if there is an allocation problem."""
     if len(allocation.problem.least) == 0:

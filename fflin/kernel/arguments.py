@@ -65,15 +65,8 @@ class Struct(Generic[T_co]):
         self.size: int = ends[-1]
         self.name = f"Struct({made.__name__})"
 
-
-class Opener(Generic[T_co]):
-    """Function by which compiled code interprets an array of words as a struct."""
-
-    def __init__(self, kind: Struct[T_co]) -> None:
-        self.kind = kind
-
     def __call__(self, words: T) -> T:
-        """Return the argument unchanged: uncompiled functions take the named tuple itself."""
+        """Return the argument: compiled functions take words, and others take the named tuple."""
         return words
 
 

@@ -14,7 +14,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sect
 from __future__ import annotations
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.lanes import inlined, load, splat, store
+from fflin.kernel.lanes import load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 
 # Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
@@ -25,7 +25,6 @@ VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
-@inlined
 def _inertia(work, at, place, bodies, first):
     """Write a body's inertia about its joint in base axes: m, m c, and R I R^T."""
     axes = vec.get_columns(work, place)
@@ -42,7 +41,6 @@ def _inertia(work, at, place, bodies, first):
     vec.put3(work, at + 7, (yy, yz, zz))
 
 
-@inlined
 def spatial_inertia_times(work, at, motion):
     """Return a spatial inertia times a motion vector, as moment and force."""
     m, h = load(work, at), vec.get3(work, at + 1)
@@ -53,7 +51,6 @@ def spatial_inertia_times(work, at, motion):
     return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
-@inlined
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies, from the base outwards."""
     places, own = tree.places, tree.own
@@ -84,7 +81,6 @@ def outwards(work, tree, q):
         _inertia(work, own + body * INERTIA, at, tree.bodies, body * INERTIA)
 
 
-@inlined
 def inwards(work, tree):
     """Write the packed M and the composite inertias, from the tips inwards."""
     bodies = len(tree.parent)
@@ -144,7 +140,6 @@ def inwards(work, tree):
         vec.add(work, at, tree.armature[index])
 
 
-@inlined
 def factorise(work, tree):
     """Factorise M = L^T D L: replace the packed M by the unit L, and write 1 / D at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
@@ -162,7 +157,6 @@ def factorise(work, tree):
             store(work, row + t, share)
 
 
-@inlined
 def solve(work, tree, x):
     """Replace a force f at x by the acceleration M^-1 f; M must be factorised."""
     packed, size = tree.packed, len(tree.row)
@@ -180,7 +174,6 @@ def solve(work, tree, x):
         store(work, x + k, value)
 
 
-@inlined
 def invert_factor(work, tree):
     """Replace L by U = L^-1, and write V = L^-1 D^-1."""
     packed, scaled = tree.packed, tree.scaled
@@ -198,7 +191,6 @@ def invert_factor(work, tree):
             store(work, scaled + (tree.row[k] + t), total * pivot)
 
 
-@inlined
 def multiply(work, tree, judged):
     """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
@@ -218,7 +210,6 @@ def multiply(work, tree, judged):
     store(work, judged, coupling)
 
 
-@inlined
 def joint_axis(work, tree, body):
     """Return the spatial axis of a joint, angular and linear, per unit of its coordinate."""
     z = vec.get3(work, tree.places + (body * PLACE + 6))
@@ -226,27 +217,23 @@ def joint_axis(work, tree, body):
     return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
 
 
-@inlined
 def motion_cross(velocity, along):
     """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
-@inlined
 def at_joint(work, at, place):
     """Shift the parent's motion vector at `at` to the origin of a joint."""
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
-@inlined
 def at_parent(work, place, force):
     """Shift a spatial force from a joint's origin to the origin of its parent."""
     return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
-@inlined
 def move_bodies(work, tree, nu):
     """Write velocities and accelerations without c, from the base outwards, for v_b = 0."""
     for entry in range(MOTION):
@@ -266,7 +253,6 @@ def move_bodies(work, tree, nu):
         vec.put6(work, at + BIAS, vec.plus6(bias, vec.times6(psi, rate)))
 
 
-@inlined
 def load_bodies(work, tree):
     """Write the inertial force of each single body, including its gyroscopic torque."""
     for body in range(len(tree.parent)):
@@ -286,7 +272,6 @@ def load_bodies(work, tree):
         vec.add3(work, tree.load + body * LOAD + FORCE, turning)
 
 
-@inlined
 def load_carried(work, tree, u):
     """Subtract the body-fixed wrenches of inputs from the forces of the bodies."""
     for index in range(len(tree.wrench_body)):
@@ -294,7 +279,6 @@ def load_carried(work, tree, u):
         vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
 
 
-@inlined
 def load_momenta(work, tree):
     """Write the momentum, the moments G and the stored momentum of each single body."""
     zero = splat(work, 0.0)
@@ -321,14 +305,12 @@ def load_momenta(work, tree):
         vec.add3(work, at, stored_momentum(work, tree, index))
 
 
-@inlined
 def stored_momentum(work, tree, index):
     """Return a stored momentum in base axes."""
     axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
     return vec.product(axes, vec.get3(tree.stored, 3 * index))
 
 
-@inlined
 def carried_wrench(work, tree, index):
     """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
     axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
@@ -336,7 +318,6 @@ def carried_wrench(work, tree, index):
     return vec.product(axes, moment), vec.product(axes, force)
 
 
-@inlined
 def write_columns(work, tree):
     """Write the generalised force per unit of each body-fixed input."""
     count = len(tree.wrench_body)
@@ -355,7 +336,6 @@ def write_columns(work, tree):
             store(work, entry + 3 * count, wrench[1][axis])
 
 
-@inlined
 def collect(work, tree):
     """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
     for index in range(len(tree.row)):
@@ -369,7 +349,6 @@ def collect(work, tree):
     vec.add6(work, tree.bias, vec.get6(work, tree.load + FORCE))
 
 
-@inlined
 def collect_momenta(work, tree):
     """Sum the bodies' momenta over subtrees, from the tips inwards."""
     for body in range(len(tree.parent) - 1, 0, -1):
@@ -385,7 +364,6 @@ def collect_momenta(work, tree):
             vec.add3(work, above + MOMENTS + 3 * index, column)
 
 
-@inlined
 def accelerate_bodies(work, tree):
     """Add what c contributes to accelerations and Psi'' (outwards), then to forces (inwards)."""
     vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))

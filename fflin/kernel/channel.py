@@ -9,7 +9,7 @@ from collections import namedtuple
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
+from fflin.kernel.lanes import chosen, load, peek, poke, store, whole, width
 
 
 class Wheels(
@@ -49,14 +49,12 @@ _OF_CHANNEL = {WHOLE: "slots sample", LANED: "held pending delay fresh"}
 CHANNEL = Struct(Channel, REALS, _OF_CHANNEL, wheels=WHEELS, pulses=PULSES)
 
 
-@inlined
 def clipped(value, low, high):
     """Return a number clipped to limits; NaN remains NaN."""
     value = chosen(value, low, low, value)
     return chosen(high, value, high, value)
 
 
-@inlined
 def limit(channel, u):
     """Saturate inputs at their limits."""
     for index in range(len(channel.low)):
@@ -64,13 +62,11 @@ def limit(channel, u):
         store(u, index, value)
 
 
-@inlined
 def is_asked(channel, step):
     """Return whether the policy is evaluated at the start of a step."""
     return channel.sample == 0 or step % channel.sample == 0
 
 
-@inlined
 def transmit(channel, step, nu, u):
     """Replace the command u by the inputs that act in this step.
 
@@ -115,7 +111,6 @@ def transmit(channel, step, nu, u):
         store(u, at, clipped(load(u, at), low, high))
 
 
-@inlined
 def _begin_pulses(channel, step, u):
     """Fire the pulse of a sample, and leave the remaining impulse to the next sample."""
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)

@@ -36,11 +36,10 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
-from fflin.kernel.lanes import compiled, inlined, load, splat, store
+from fflin.kernel.lanes import compiled, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
 
 
-@inlined
 def _coriolis(work, at, w):
     """Return the moment and force 2 B w of a joint's subtree."""
     G = vec.get_columns(work, at + MOMENTS)
@@ -51,7 +50,6 @@ def _coriolis(work, at, w):
     return moment, vec.plus(force, force)
 
 
-@inlined
 def _coriolis_transposed(work, at, along):
     """Return the moment of 2 B^T s for a motion vector s; the force of 2 B^T s is zero."""
     G = vec.get_columns(work, at + MOMENTS)
@@ -64,7 +62,6 @@ def _coriolis_transposed(work, at, along):
     return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
-@inlined
 def _add_column(work, at, width, force):
     """Add a moment and a force to the first six rows of a column, the rows of the base."""
     for index in range(3):
@@ -72,7 +69,6 @@ def _add_column(work, at, width, force):
         vec.add(work, at + (3 + index) * width, force[1][index])
 
 
-@inlined
 def differentiate(work, tree):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
@@ -133,7 +129,6 @@ def differentiate(work, tree):
             store(work, row + 3 * width, force[part])
 
 
-@inlined
 def _push(work, tree, by_u):
     """Write the derivatives over the inputs: columns of M^-1, or linear combinations of them."""
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
@@ -150,7 +145,6 @@ def _push(work, tree, by_u):
             store(work, by_u + row * count + tree.input[index], total)
 
 
-@inlined
 def _solve(work, tree, slopes):
     """Write -M^-1 times the derivatives of the forces, six columns at a time."""
     size = len(tree.row)
@@ -171,7 +165,6 @@ def _solve(work, tree, slopes):
             vec.put6(work, slopes + column + row * width, total)
 
 
-@inlined
 def _pack(rows, first, lanes):
     """Copy the rows of eight points into an array (entries, lanes)."""
     for entry in range(len(lanes)):
@@ -179,7 +172,6 @@ def _pack(rows, first, lanes):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
-@inlined
 def _unpack(work, start, entries, out, first, offset):
     """Copy entries of a laned array to the rows of eight points, from column `offset` on."""
     for entry in range(entries):

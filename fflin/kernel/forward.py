@@ -20,7 +20,7 @@ from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Kind, Struct
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
-from fflin.kernel.lanes import angle, called, chosen, inlined, load, store
+from fflin.kernel.lanes import angle, called, chosen, load, store
 from fflin.kernel.tree import Tree
 
 
@@ -85,7 +85,6 @@ def configure(work, robot, q):
     bodies.inwards(work, robot.tree)
 
 
-@inlined
 def joint_position(robot, q, joint):
     """Return the position of a joint; the angle of a continuous joint is in (-pi, pi]."""
     at = robot.index[joint]
@@ -95,13 +94,11 @@ def joint_position(robot, q, joint):
     return value / load(robot.scale, joint)
 
 
-@inlined
 def seen(robot, q):
     """Return the base's quaternion relative to the reference."""
     return vec.quaternion_times(vec.attitude(robot.origin), vec.attitude(q))
 
 
-@inlined
 def apply_faults(faults, triads, t, u, given):
     """Write the inputs that faulty actuators produce for a command u at a time t."""
     for index in range(len(faults.gain)):
@@ -112,7 +109,6 @@ def apply_faults(faults, triads, t, u, given):
         vec.put3(given, at, vec.product(columns, vec.get3(given, at)))
 
 
-@inlined
 def turn_held(robot, point):
     """Rotate reference-frame wrenches to base axes."""
     pushing = point.pushing
@@ -122,7 +118,6 @@ def turn_held(robot, point):
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
 
-@inlined
 def push(work, tree, pushing):
     """Write the generalised force of inputs in base axes at the offset of c."""
     size, count = len(tree.row), len(tree.wrench_body)
@@ -187,14 +182,12 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 
-@inlined
 def begin_step(reference):
     """Set the sums of a step to zero."""
     for entry in range(STEP_IMPULSE, SUMS):
         store(reference.sums, entry, 0.0)
 
 
-@inlined
 def add_wrench(work, robot, reference, point, weight, moment):
     """Add the external wrench at a stage to the sums of a step.
 
@@ -214,7 +207,6 @@ def add_wrench(work, robot, reference, point, weight, moment):
     vec.add3(reference.sums, STEP_SHIFT, vec.times(force, moment))
 
 
-@inlined
 def end_step(reference, h):
     """Add the sums of a finished step of h [s] to the sums up to now."""
     per_mass = load(reference.per_mass, 0)
@@ -227,7 +219,6 @@ def end_step(reference, h):
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
 
 
-@inlined
 def kept_at(reference, t):
     """Return the reference of linear and angular momentum and of the centre of mass."""
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
@@ -236,7 +227,6 @@ def kept_at(reference, t):
     return momentum, vec.plus(shift, flown)
 
 
-@inlined
 def start_at(work, robot, reference, point):
     """Write the initial momentum and centre of mass at a point whose M is already computed."""
     axes, tree = vec.axes_of(point.q), robot.tree
@@ -252,7 +242,6 @@ def start_at(work, robot, reference, point):
     vec.put3(reference.start, 6, vec.plus(position, lever))
 
 
-@inlined
 def _momentum_error(work, robot, nu, momentum):
     """Return a given (angular, linear) momentum in base axes minus the robot's momentum at nu."""
     tree = robot.tree
@@ -267,7 +256,6 @@ def _momentum_error(work, robot, nu, momentum):
     return angular, linear
 
 
-@inlined
 def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 

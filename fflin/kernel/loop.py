@@ -9,10 +9,10 @@ import numpy as np
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
-from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, REALS, Opener, Struct
+from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, REALS, Struct
 from fflin.kernel.channel import CHANNEL, is_asked, transmit
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
-from fflin.kernel.lanes import angle, below, chosen, compiled, inlined, load, root, store
+from fflin.kernel.lanes import angle, below, chosen, compiled, load, root, store
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 
 
@@ -63,10 +63,8 @@ ARGUMENTS = Struct(
     point=POINT,
     stages=Struct(Stages, LANED),
 )
-_opened = Opener(ARGUMENTS)
 
 
-@inlined
 def _combine(shares, row, rates, out):
     """Write a combination of v and the accelerations of the stages."""
     size = len(out)
@@ -79,7 +77,6 @@ def _combine(shares, row, rates, out):
         store(out, index, total)
 
 
-@inlined
 def goes_on(stop, origin, q, rates):
     """Return whether all rates are within finite bounds and the base is within the chart."""
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
@@ -91,7 +88,6 @@ def goes_on(stop, origin, q, rates):
     return good
 
 
-@inlined
 def _decide(work, channel, law, robot, point, step, stage, t):
     """Write the commanded inputs at a stage."""
     if is_asked(channel, step):
@@ -100,7 +96,6 @@ def _decide(work, channel, law, robot, point, step, stage, t):
     transmit(channel, step, point.nu, point.u)
 
 
-@inlined
 def _move(robot, method, stages, point, stage):
     """Move the point from a stage with known acceleration to the next stage or the step's end."""
     rates, along = stages.rates, stages.along
@@ -125,7 +120,7 @@ def advance(words, clock, last, every, rows, work):
     is written every `every` steps: q, nu, u, and the reference of momentum (6,) and centre of mass
     (3,). `work` has `Layout.size` entries.
     """
-    of = _opened(words)
+    of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
     h, at = method.h, 0  # `at` is the place of the next entry in `rows`
@@ -202,21 +197,17 @@ RUN_STATISTICS = Struct(
     settled=REAL,
     at=POINT,
 )
-_opened_statistics = Opener(RUN_STATISTICS)
 
 
-@inlined
 def _size(value):
     return chosen(value, 0.0, -value, value)
 
 
-@inlined
 def _grow(stats, index, value):
     """Replace an entry of the statistics by a value if the value is larger."""
     store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
-@inlined
 def _compare(stats, step):
     """Write the errors at a step, and the largest magnitude of each kind."""
     at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
@@ -248,7 +239,7 @@ def take(words, rows, first, count):
 
     `words` represent `RunStatistics`.
     """
-    stats = _opened_statistics(words)
+    stats = RUN_STATISTICS(words)
     at, sizes, kept = stats.at, stats.sizes, 0
     width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:

@@ -15,7 +15,7 @@ from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.lanes import angle, called, chosen, inlined, load, splat, store, whole
+from fflin.kernel.lanes import angle, called, chosen, load, splat, store, whole
 from fflin.kernel.tree import MOTION, PLACE
 
 _NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
@@ -44,7 +44,6 @@ _OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
 PATH = Struct(Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT)
 
 
-@inlined
 def _cubic(coefficients, k, s, out):
     size = len(out)
     for index in range(size):
@@ -53,7 +52,6 @@ def _cubic(coefficients, k, s, out):
         out[index] = coefficients[at] + s * (coefficients[at + size] + s * value)
 
 
-@inlined
 def _latest(knots, time):
     """Return the index of the last knot at or before a time, 0 if the time is before all knots."""
     low, high = 0, len(knots)
@@ -66,7 +64,6 @@ def _latest(knots, time):
     return low
 
 
-@inlined
 def _placed(knots, time):
     """Return the index of the interval that contains a time, and its elapsed fraction."""
     last = len(knots) - 2
@@ -77,7 +74,6 @@ def _placed(knots, time):
     return k, 0.0 if s < _NEAR else min(s, 1.0)
 
 
-@inlined
 def _follow(robot, path, t):
     """Write the point of the trajectory at a time, with u in base axes.
 
@@ -108,7 +104,6 @@ def _follow(robot, path, t):
     return after
 
 
-@inlined
 def error(robot, path, point):
     """Write the error of a point from the followed point, in the axes of the followed point."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
@@ -130,7 +125,6 @@ def error(robot, path, point):
         store(e, 6 + n + index, load(point.nu, index) - load(there.nu, index))
 
 
-@inlined
 def track(robot, path, point, u, t):
     """Write the inputs u* - K e at the time t of the run."""
     after = _follow(robot, path, t)
@@ -238,7 +232,6 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
-@inlined
 def _measure(work, robot, law, point, count):
     """Write the outputs y of a sample, including its noise."""
     outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
@@ -254,7 +247,6 @@ def _measure(work, robot, law, point, count):
         store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
 
 
-@inlined
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
     total, width = splat(x, 0.0), len(x)
@@ -263,7 +255,6 @@ def _times(matrix, row, x):
     return total
 
 
-@inlined
 def command(work, robot, law, point, t, count, stage):
     """Write the commands of a policy at sample number `count`, for one stage of a step."""
     if law.kind == TRACK:
@@ -278,7 +269,6 @@ def command(work, robot, law, point, t, count, stage):
         _filter(law.filter, law.y, law.u, row, stage)
 
 
-@inlined
 def _feed_back_between(robot, law, point):
     """Write the commands that the interpolated feedback laws of a grid give, lane by lane."""
     grid, y, u = law.grid, law.y, law.u
@@ -300,7 +290,6 @@ def _feed_back_between(robot, law, point):
                 lanes.poke(u, row, lane, lanes.peek(u, row, lane) + weight * total)
 
 
-@inlined
 def _corner(grid, corner, lane):
     """Return a corner of a lane's grid cell as its interpolation weight and its gain's index."""
     weight, cell = 1.0, 0

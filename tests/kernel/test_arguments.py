@@ -22,7 +22,7 @@ from fflin.kernel.arguments import (
     laid_out,
     words_of,
 )
-from fflin.kernel.lanes import called, inlined
+from fflin.kernel.lanes import called
 from fflin.kernel.machine_code import PartLibrary, opener, translated
 
 pytestmark = pytest.mark.compiled
@@ -110,7 +110,6 @@ def square(x):
     return x * x + 1.0
 
 
-@inlined
 def twice(x):
     return 2.0 * square(x)
 
