@@ -55,18 +55,9 @@ def _coriolis_transposed(work, at, along):
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
-    moment = vec.plus(
-        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
-    )
+    moment = vec.minus(vec.times(w, trace), vec.across(G, w))
+    moment = vec.plus(moment, vec.cross(vec.get3(work, at + MOMENTUM), along[1]))
     return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
-
-
-def _add_column(work, at, width, force):
-    """Add a moment and a force to the first six rows of a column, the rows of the base."""
-    for index in range(3):
-        vec.add(work, at + index * width, force[0][index])
-        vec.add(work, at + (3 + index) * width, force[1][index])
 
 
 def differentiate(work, tree):
@@ -115,18 +106,15 @@ def differentiate(work, tree):
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
-        _add_column(work, tree.lower + column, width, by_q)
-        _add_column(work, tree.lower + (column + 6 + n), width, by_v)
+        bodies.add_column(work, tree.lower + column, width, by_q)
+        bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
     # The base's force over omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
         weight = inertia_times(work, tree.inertias, turning)
-        moment, force = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
-        for part in range(3):
-            row = tree.lower + (part * width + 6 + n + index)
-            store(work, row, moment[part])
-            store(work, row + 3 * width, force[part])
+        total = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
+        bodies.add_column(work, tree.lower + (6 + n + index), width, total)
 
 
 def _push(work, tree, by_u):
@@ -201,7 +189,6 @@ def derive(tree, points, out, lanes, work):
             bodies.move_bodies(work, tree, lanes.nu)
             bodies.load_bodies(work, tree)
             bodies.load_carried(work, tree, lanes.u)
-            bodies.load_momenta(work, tree)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
         for k in range(size):  # `factorise` overwrites the diagonal of the packed M

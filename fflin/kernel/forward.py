@@ -202,8 +202,7 @@ def add_wrench(work, robot, reference, point, weight, moment):
     torque = vec.plus(vec.product(axes, moments), vec.cross(position, vec.plus(force, falls)))
     torque = vec.plus(torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls))
     force = vec.plus(force, falls)
-    vec.add3(reference.sums, STEP_IMPULSE, vec.times(force, weight))
-    vec.add3(reference.sums, STEP_IMPULSE + 3, vec.times(torque, weight))
+    vec.add6(reference.sums, STEP_IMPULSE, vec.times6((force, torque), weight))
     vec.add3(reference.sums, STEP_SHIFT, vec.times(force, moment))
 
 
@@ -211,11 +210,8 @@ def end_step(reference, h):
     """Add the sums of a finished step of h [s] to the sums up to now."""
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
-    vec.add3(
-        reference.sums,
-        SHIFT,
-        vec.times(vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT)), per_mass),
-    )
+    shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
+    vec.add3(reference.sums, SHIFT, vec.times(shift, per_mass))
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
 
 
@@ -236,8 +232,7 @@ def start_at(work, robot, reference, point):
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
     linear = vec.times(vec.product(axes, linear), -1.0)
     angular = vec.minus(vec.cross(position, linear), vec.product(axes, angular))
-    vec.put3(reference.start, 0, linear)
-    vec.put3(reference.start, 3, angular)
+    vec.put6(reference.start, 0, (linear, angular))
     lever = vec.times(vec.product(axes, lever), load(reference.per_mass, 0))
     vec.put3(reference.start, 6, vec.plus(position, lever))
 
@@ -273,8 +268,7 @@ def impose(work, robot, reference, point, t):
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
     # Solve with the base's rigid-body block of M, using the inertia about the centre of mass.
-    xx, xy, xz = vec.get3(work, tree.inertias + 4)
-    yy, yz, zz = vec.get3(work, tree.inertias + 7)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))
     p, q, r = lever[0] * d[0], lever[1] * d[1], lever[2] * d[2]
@@ -284,5 +278,4 @@ def impose(work, robot, reference, point, t):
     inverse = 1.0 / (a * x + f * y + g * z)
     by = (x, y, z), (y, a * c - g * g, f * g - a * h), (z, f * g - a * h, a * b - f * f)
     w = vec.times(vec.product(by, about), inverse)
-    vec.add3(nu, 0, w)
-    vec.add3(nu, 3, vec.plus(vec.times(linear, per_mass), vec.cross(d, w)))
+    vec.add6(nu, 0, (w, vec.plus(vec.times(linear, per_mass), vec.cross(d, w))))
