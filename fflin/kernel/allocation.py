@@ -9,18 +9,16 @@ References
 C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, SIAM, 1995, chapter 23.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np
 
 from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import INDICES, LANED, Struct, empty
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
 from fflin.kernel.lanes import called, load, root, store
+from fflin.kernel.tree import INDICES, LANED, Struct, empty
 
 # Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
 # smallest.

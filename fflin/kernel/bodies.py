@@ -11,8 +11,6 @@ References
 R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sections 6.2 and 6.5.
 """
 
-from __future__ import annotations
-
 from fflin.kernel import vectors as vec
 from fflin.kernel.lanes import load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE

@@ -22,8 +22,6 @@ S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of r
 using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np

@@ -10,18 +10,13 @@ in base axes. Position and linear velocity of the base are left out, because the
 about the initial position of the base's origin. Positions are relative to this point.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
-
-import numpy as np
 
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Kind, Struct
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
 from fflin.kernel.lanes import angle, called, chosen, load, store
-from fflin.kernel.tree import Tree
+from fflin.kernel.tree import FLAGS, INDICES, LANED, REALS, TREE, Struct
 
 
 class Mechanics(
@@ -64,14 +59,6 @@ class CommonPoint(Point):
     """Point that is common to all lanes."""
 
 
-_OF_TREE = {
-    INDICES: "parent index coordinate target row depth path driven wrench_body input stored_body",
-    WHOLE: "entries places own inertias packed scaled diagonal square motion load bias c columns "
-    "lower held size",
-    LANED: "fixed bodies wrench stored stiffness damping",
-}
-_AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
-TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
 COMMON_POINT = Struct(CommonPoint)
 _OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
@@ -182,12 +169,6 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 
-def begin_step(reference):
-    """Set the sums of a step to zero."""
-    for entry in range(STEP_IMPULSE, SUMS):
-        store(reference.sums, entry, 0.0)
-
-
 def add_wrench(work, robot, reference, point, weight, moment):
     """Add the external wrench at a stage to the sums of a step.
 
@@ -207,12 +188,14 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 
 def end_step(reference, h):
-    """Add the sums of a finished step of h [s] to the sums up to now."""
+    """Add the sums of a finished step of h [s] to the sums up to now, and set them to zero."""
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
     shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
     vec.add3(reference.sums, SHIFT, vec.times(shift, per_mass))
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
+    for entry in range(STEP_IMPULSE, SUMS):
+        store(reference.sums, entry, 0.0)
 
 
 def kept_at(reference, t):

@@ -6,8 +6,6 @@ it. `kernel.machine_code` compiles the same function, also for arrays with a sec
 lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import TypeAlias, TypeVar

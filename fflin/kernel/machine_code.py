@@ -42,8 +42,7 @@ from numba.np.arrayobj import populate_array
 from numba.types import Array, Type, boolean, float64, intp, void
 
 from fflin.kernel import lanes as uncompiled
-from fflin.kernel.arguments import Kind, Struct
-from fflin.kernel.tree import LANES
+from fflin.kernel.tree import LANES, Kind, Struct
 
 _DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)

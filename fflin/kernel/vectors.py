@@ -5,8 +5,6 @@ displacement has the order of the state: the base's rotation and translation in 
 joints.
 """
 
-from __future__ import annotations
-
 from math import factorial
 
 import numpy as np
@@ -192,9 +190,9 @@ def columns_of(quaternion):
     )
 
 
-def attitude(q):
-    """Return the base's quaternion at a configuration."""
-    return get3(q, 3), load(q, 6)
+def attitude(q, at=0):
+    """Return the base's quaternion at a configuration, which begins at an index."""
+    return get3(q, at + 3), load(q, at + 6)
 
 
 def axes_of(q):

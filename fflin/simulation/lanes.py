@@ -19,9 +19,8 @@ from fflin.control.linear_controller import LinearController, OutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback, decider, measured_at
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.kernel import loop
-from fflin.kernel.arguments import laid_out, words_of
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree, work_space
+from fflin.kernel.tree import LANES, batch_tree, laid_out, words_of, work_space
 from fflin.robot.joints import ROOT
 from fflin.simulation.packing import SLOTS, packed
 from fflin.simulation.plan import Plan, Times
