@@ -7,14 +7,14 @@ import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
-from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Values
 from fflin.control.optimal.riccati import Solution, rates_of
@@ -122,10 +122,7 @@ class Gain(Design):
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
-    def __repr__(self) -> str:
-        return titled(self, nx=self.K.shape[1], nu=len(self.K))
-
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return the report: the gain, its poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
@@ -150,14 +147,15 @@ class Gain(Design):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        parts = [
-            f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
-            f"K ({nu} x {nx}){shown}",
-            _poles(self),
-            fold(figures),
-            *(fold(f"{what}: {said}") for what, said in more.items() if said),
-        ]
-        return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
+        return "\n\n".join(
+            (
+                f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
+                f"K ({nu} x {nx}){shown}",
+                _poles(self),
+                fold(figures),
+                *(fold(f"{what}: {said}") for what, said in more.items() if said),
+            )
+        )
 
     @property
     def closed_loop(self) -> Array:
@@ -214,18 +212,6 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
-
-
-def titled(record: Any, **sizes: int) -> str:
-    """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
-    time = f"dt={record.dt:g} s" if record.dt else "continuous"
-    parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
-    parts += [
-        f"{key}={getattr(record, key):{form}}"
-        for key, form in (("margin", ".3g"), ("residual", ".1e"))
-        if hasattr(record, key)
-    ]
-    return f"{type(record).__name__}({', '.join(parts)})"
 
 
 def make_gain(
