@@ -189,9 +189,8 @@ class Motion(Design):
             f"com drift {self.com_drift.max(initial=0.0):.1e} m{stopped})"
         )
 
-    def __str__(self) -> str:
-        report = motion_report(self)
-        return report if self.verified else f"{report}\n{record.NOT_VERIFIED}"
+    def _report(self) -> str:
+        return motion_report(self)
 
     @property
     def reference(self) -> pin.SE3:
