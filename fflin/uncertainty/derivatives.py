@@ -294,14 +294,11 @@ class ModelDerivatives:
         B = np.zeros_like(self._rates.by_u)
         F_q: Array = np.zeros((size, size - 6))
         F_nu = np.zeros((size, size))
-        if one.spring >= 0:
-            moved = state.joint_positions(self._q) - self.robot.springs.rest
-            F_q[6 + one.spring, one.spring] = one.by_stiffness
-            F[6 + one.spring] = one.by_stiffness * moved[one.spring]
-        if one.damper >= 0:
-            at = 6 + one.damper
-            F_nu[at, at] = one.by_damping
-            F[at] += one.by_damping * state.velocities(self._v)[at]
+        if (joint := one.joint) >= 0:
+            at = 6 + joint
+            moved = state.joint_positions(self._q)[joint] - self.robot.springs.rest[joint]
+            F[at] = one.by_stiffness * moved + one.by_damping * state.velocities(self._v)[at]
+            F_q[at, joint], F_nu[at, at] = one.by_stiffness, one.by_damping
         if one.wrench:
             joint, column, wrench = one.wrench
             B[:, column] = self._jacobians()[joint - ROOT].T @ wrench

@@ -268,7 +268,7 @@ def linear_fractional(
         one = each.parameter
         if one.of in pieces and one.part in OF_PIECES:
             of_pieces.setdefault(one.of, {})[one.part] = at
-        elif one.of in modes and one.damper >= 0:
+        elif one.of in modes and one.joint >= 0:
             of_modes.setdefault(one.of, {})[one.part] = at
         else:
             form.add_alone(at)
@@ -384,11 +384,10 @@ class _Form:
     def add_alone(self, at: int) -> None:
         """Add the effect of a parameter of a joint, a thruster or a wheel."""
         one = self.ranges[at].parameter
-        if one.spring >= 0:
-            self.force[6 + one.spring] += self.times(at, self.x[[6 + one.spring]])[0]
-        elif one.damper >= 0:
-            row = self.state.groups.qdot_m.start + one.damper
-            self.force[6 + one.damper] += self.times(at, self.x[[row]])[0]
+        if one.joint >= 0:
+            rate = self.x[[self.state.groups.qdot_m.start + one.joint]]
+            signal = one.by_stiffness * self.x[[6 + one.joint]] + one.by_damping * rate
+            self.force[6 + one.joint] += self.times(at, signal)[0]
         elif one.wrench:
             joint, column, wrench = one.wrench
             given = self.jacobians[joint].T @ wrench

@@ -84,7 +84,8 @@ class Uncertain:
                 "remove it with robot.replace(outputs=)"
             )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
-        pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
+        varied = [each.parameter for each in self.ranges if each.parameter.by_stiffness]
+        pulled = [rest[one.joint] for one in varied]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
             raise InputError(
