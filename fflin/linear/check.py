@@ -221,11 +221,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
 
     x0 = state.to_state(q, v, near=lin.x0)
     rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
-    rate, sizes = model.rates(point[None])[0], scales.rates()
-    for name, part in state.groups._asdict().items():
-        size = max(_largest(sizes[part]) or 1.0, _largest(rate[part]))
-        error = _largest(lin.f0[part] - rate[part]) / size
-        rows.append(Row("point", f"f0[{name}]", error, route))
+    rows += _rows("point", scales.rate_errors(model.rates(point[None])[0]), route)
 
     # With the default inputs, M^-1 is the lower half of B.
     inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
@@ -405,9 +401,7 @@ class Scales:
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
         # Effect of a unit velocity at the present rates; for rotations, also at the present speed
         # of the base.
-        turning = rate * np.array(
-            [_largest(unit[ANGULAR]), _largest(unit[LINEAR]), _largest(unit[6:])]
-        )
+        turning = rate * np.array([_largest(x) for x in np.split(unit, (3, 6))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
         terms[:, 0] *= _largest(self._state.chart(lin.q).J)
@@ -425,12 +419,16 @@ class Scales:
             momentum += float(np.linalg.norm(stored))
         return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
-    def rates(self) -> Array:
-        """Return the sizes (nx,) of the largest terms of f0, which may cancel."""
+    def rate_errors(self, f0: Array) -> dict[str, float]:
+        """Compare with another f0, relative to its largest terms, which may cancel."""
         mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
         push = _largest(self._lin.u0 * self._input_mobility)
         push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)
-        return np.concatenate((np.ones(self._nv), mobility * push))
+        sizes, errors = np.concatenate((np.ones(self._nv), mobility * push)), dict[str, float]()
+        for name, part in self._state.groups._asdict().items():
+            size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
+            errors[f"f0[{name}]"] = _largest(self._lin.f0[part] - f0[part]) / size
+        return errors
 
     def difference_steps(self) -> Array:
         """Return the steps (nx + nu,) for differences in x and u at the model's point."""

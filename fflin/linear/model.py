@@ -399,7 +399,8 @@ class LinearModel(StateSpace):
         ----------
         path : str or Path
             Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to a
-            separate file, such as NAME.A.csv.
+            separate file, such as NAME.A.csv; these tables are for other programs, and `load` does
+            not read them.
 
         Raises
         ------
@@ -415,7 +416,7 @@ class LinearModel(StateSpace):
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
-        """Read a model that `save` wrote, and restore every value bit for bit.
+        """Read a .npz, .mat or .json file that `save` wrote, and restore every value bit for bit.
 
         Raises
         ------

@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.names import matching, stands_for_any
 from fflin.base.rotation import skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, positive
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
@@ -137,13 +137,8 @@ class Parameters(dict[str, Parameter]):
             com = [parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)]
             for entry, (i, j) in ENTRIES.items():
                 inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
-            mass, density = parts.get("mass", piece.mass), parts.get("density", 1.0)
-            if not density > 0.0:
-                raise InputError(
-                    f"the density of '{name}' has the factor {density:.4g}, expected above 0"
-                )
-            if not mass > 0.0:
-                raise InputError(f"the mass of '{name}' is {mass:.4g} kg, expected above 0")
+            mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
+            density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
             # Inertias that are not changed are accepted, for example zero for a point mass. An
             # impossible inertia may be changed unless the change makes it worse.
             was, least = (
