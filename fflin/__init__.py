@@ -68,8 +68,7 @@ _PUBLIC = {
         "batch.gains": "ScheduledFeedback",
     },
     "C code": {
-        "export.writing": "write_c",
-        "export.claw": "CLaw",
+        "export.c_code": "write_c CLaw",
     },
     "Simulation": {
         "simulation.simulate": "simulate",

@@ -113,8 +113,8 @@ from fflin.control.tracking import TrajectoryOutputFeedback as TrajectoryOutputF
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
 
 # C code
-from fflin.export.writing import write_c as write_c
-from fflin.export.claw import CLaw as CLaw
+from fflin.export.c_code import write_c as write_c
+from fflin.export.c_code import CLaw as CLaw
 
 # Simulation
 from fflin.simulation.simulate import simulate as simulate
