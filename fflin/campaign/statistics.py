@@ -19,8 +19,7 @@ from fflin.kernel import loop
 from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES
-from fflin.simulation.lanes import Statistics
-from fflin.simulation.packing import no_law
+from fflin.simulation.lanes import Statistics, no_law
 from fflin.simulation.plan import Plan
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
 from fflin.simulation.run import Recording, stop_of

@@ -71,9 +71,6 @@ class ToolModel(StateSpace, Design):
     v: Array
     reference: str
 
-    def __repr__(self) -> str:
-        return f"ToolModel('{self.robot}', '{self.tool}', nx={len(self.A)}, dt={self.dt:g})"
-
 
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.

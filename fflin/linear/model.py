@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, FrozenArrays, frozen, number, positive
+from fflin.base.validation import Array, Result, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StateSpace(FrozenArrays):
+class StateSpace(Result):
     """Matrices of a linear model about a point, with names and units of its signals."""
 
     A: Array
@@ -186,16 +186,6 @@ class LinearModel(StateSpace):
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
         return vars(self).setdefault(name, make(self))
-
-    def __repr__(self) -> str:
-        nx, nu = self.B.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return f"LinearModel('{self.robot}', nx={nx}, nu={nu}, frame='{self.frame}', {time})"
-
-    def __str__(self) -> str:
-        from fflin.base.record import NOT_VERIFIED
-
-        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     @property
     def reference(self) -> pin.SE3:

@@ -154,11 +154,10 @@ class Trajectory(Design):
             f"{self.t[-1]:g} s, hold='{self.hold}', frame='{self.frame}')"
         )
 
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return a text about the trajectory, with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
-        note = f"\n{folded(self._note.splitlines())}" if self._note else ""
-        return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
+        return folded([repr(self), said, *self._note.splitlines()])
 
     @cached_property
     def _aba(self) -> Aba:

@@ -105,11 +105,7 @@ class LFT(Design):
     output_names: tuple[str, ...]
     robot: str
 
-    def __repr__(self) -> str:
-        total = int(self.repeats.sum())
-        return f"LFT('{self.robot}', nx={len(self.A)}, {len(self.repeats)} parameters, nw={total})"
-
-    def __str__(self) -> str:
+    def _report(self) -> str:
         rows = [("parameter", "unit", "least", "largest", "repeated")]
         for name, unit, middle, half, repeats in zip(
             self.parameters, self.units, self.middle, self.half, self.repeats, strict=True

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.record import NOT_VERIFIED, content_digest, read_record
+from fflin.base.record import content_digest, read_record
+from fflin.base.validation import NOT_VERIFIED
 from tests.support.messages import any_wording
 
 FLIPS = 150

@@ -385,7 +385,7 @@ def test_a_command_that_is_no_number_is_told(robots):
 
 
 def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(robots, monkeypatch, caplog):
-    monkeypatch.setattr(lanes, "LONG_RUN", 0.0)
+    monkeypatch.setattr("fflin.simulation.simulate.LONG_RUN", 0.0)
     options = {"duration": 0.1, "linear": False}
     fflin.simulate(robots["cubesat"], **options, engine="python")
     (record,) = caplog.records
