@@ -148,7 +148,7 @@ from fflin.campaign.plots import plot_validity as plot_validity
 from fflin.campaign.plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles
 from fflin.control.plots import plot_loops as plot_loops
-from fflin.simulation.motion import plot_motion as plot_motion
+from fflin.simulation.plots import plot_motion as plot_motion
 from fflin.campaign.plots import plot_campaign as plot_campaign
 
 # Errors
