@@ -8,7 +8,6 @@ is less sensitive to rounding.
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import NamedTuple
 
 import numpy as np
 
@@ -56,17 +55,15 @@ _DECAY = 1e-7
 _DEAD = 1e4 * EPS
 
 
-class Split(NamedTuple):
-    """State space of a model, split into a controllable and an uncontrollable part."""
+def split_by_poles(
+    X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False
+) -> tuple[Array, Array, Array, FixedPoles]:
+    """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
 
-    inside: Array  # (nx, d), basis of the controllable subspace
-    outside: Array  # (nx, nx - d), complement; for a dual pair, the unobservable subspace
-    rows: Array  # (nx - d, nx); no input acts on rows @ x
-    fixed: FixedPoles  # poles of the complement
-
-
-def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
-    """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s."""
+    Return a basis (nx, d) of the controllable subspace, its complement (nx, nx - d), which is the
+    unobservable subspace of a dual pair, rows (nx - d, nx) on which no input acts, and the fixed
+    poles.
+    """
     # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
     # The states are scaled to units of energy, x = to_x xi. Velocities are scaled to L^T nu with
     # M = L L^T, so that |xi|^2 is twice the kinetic energy. Positions are scaled likewise and
@@ -124,7 +121,7 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
             margin &= decided(1.0, shapes[:, most]).transformed(1.0, halved=True)
         settling = slow.transformed(1.0, halved=True)
         fixed = FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
-    return Split(to_x @ inside, to_x @ rest, rest.T @ from_x, fixed)
+    return to_x @ inside, to_x @ rest, rest.T @ from_x, fixed
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
@@ -166,22 +163,15 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     return found, margin
 
 
-class Unobservable(NamedTuple):
-    """Free motions that a measurement of positions and velocities does not observe."""
-
-    motions: Array  # (2 nv, k), basis of the unobservable subspace, (s, ds/dt)
-    shapes: tuple[tuple[complex, Values], ...]  # (nv, m), for each nonzero continuous pole or pair
-    fixed: FixedPoles
-
-
 def unobservable(
     system: SecondOrder, position: Noisy, velocity: Noisy, dt: float
-) -> Unobservable | None:
+) -> tuple[Array, tuple[tuple[complex, Values], ...], FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
     The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The
-    result is None if this test is inconclusive: K or D is not symmetric, D is indefinite, sampling
-    aliases two poles, or a pole is defective.
+    result is a basis (2 nv, k) of them, as (s, ds/dt), each nonzero pole or pair of the continuous
+    model with its shapes (nv, m), and the fixed poles. It is None if this test is inconclusive: K
+    or D is not symmetric, D is indefinite, sampling aliases two poles, or a pole is defective.
     """
     # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
     # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.
@@ -238,7 +228,7 @@ def unobservable(
         margin=margin,
         settling=Margin() if at_zero.shape[1] else decided(slowest.ratio, slowest.at),
     )
-    return Unobservable(np.hstack(motions), tuple(missed), fixed)
+    return np.hstack(motions), tuple(missed), fixed
 
 
 def _missed_shapes_at(

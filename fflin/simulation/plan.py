@@ -144,12 +144,10 @@ class Plan:
         expected = "a list of functions event(t, q, v)"
         self.events = tuple(instance("events", options.events, Sequence, expected))
         functions: list[tuple[str, object, str]] = [("event", x, "(t, q, v)") for x in self.events]
-        if options.callback is not None:
-            functions.append(("callback", options.callback, "(t, q, v, u)"))
-        if options.disturbance is not None:
-            functions.append(("disturbance", options.disturbance, "(t, q, v)"))
+        functions.append(("callback", options.callback, "(t, q, v, u)"))
+        functions.append(("disturbance", options.disturbance, "(t, q, v)"))
         for name, given, arguments in functions:
-            if not callable(given):
+            if not (callable(given) or (given is None and name != "event")):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
         # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
@@ -362,15 +360,14 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     The time is rounded up to tens of seconds.
     """
     lin, closed = policy.lin, closed_loop(policy)
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
+    _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
     assert closed is not None
     loop, dt, _ = closed
     step = dt or _LOOK
     if not dt:
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
     history = np.zeros((math.ceil(LONGEST / step) + 1, len(loop)))
-    history[0, : len(lin.x0)] = start[[state.names.index(x) for x in lin.state_names]] - lin.x0
+    history[0, : len(start)] = start
     for row, after in pairwise(history):
         after[:] = loop @ row
     away, wheels = np.zeros(len(history), dtype=bool), {f"q_m.{name}" for name in robot.wheels}
