@@ -18,12 +18,17 @@ from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Values
 from fflin.control.optimal.riccati import Solution, rates_of
+from fflin.dynamics.coordinates import frame_of
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.fit import require_same
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     import control
+    import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
+    from fflin.robot.robot import Robot
 
 # A gain with more entries than this, as for a robot with more than three joints, is not shown.
 _LARGE = 9 * 18
@@ -191,6 +196,22 @@ class Gain(Design):
         """Gain and phase margins at the inputs, computed at first access."""
         S = selection(self.regulated or self.state_names, self.state_names)
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
+
+
+def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
+    """Return the model of a robot at the point stored with a gain, relative to a reference.
+
+    If the robot has other states or inputs than the gain, the error begins with the text `made`.
+    """
+    from fflin.linear.linearization import linearize
+
+    frame = frame_of(robot, gain.frame)
+    state = StateMap(robot, reference=reference, frame=frame)
+    for kind, there in (("state", state), ("input", Actuation(state))):
+        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
+        require_same(made, robot, kind, own, (there.names, there.units))
+    q, v = state.to_pinocchio(gain.x0)
+    return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
 
 def make_gain(

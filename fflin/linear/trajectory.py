@@ -131,11 +131,8 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        q, v, u = (
-            _configurations(robot, self.q, count),
-            as_double("v", self.v),
-            as_double("u", self.u),
-        )
+        q = _configurations(robot, self.q, count)
+        v, u = as_double("v", self.v), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
         u = np.vstack((u, u[-1:])) if short else u
@@ -147,10 +144,8 @@ class Trajectory(Design):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
-        values["hold"] = self.hold or ("previous" if short else "linear")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        hold = self.hold or ("previous" if short else "linear")
+        vars(self).update(t=times, q=frozen(q), v=frozen(v), u=frozen(u), hold=hold)
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -231,16 +226,7 @@ class Trajectory(Design):
             times = np.append(times, self.t[-1])
         q, v, _ = self.points(times)
         k, s = intervals_of(self.t, times)
-        return Trajectory(
-            self.robot,
-            times,
-            q,
-            v,
-            self._input(k, s[:, None]),
-            hold=self.hold,
-            frame=self.frame,
-            verified=self.verified,
-        )
+        return Trajectory._of(self, t=times, q=q, v=v, u=self._input(k, s[:, None]), _note="")
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""

@@ -347,56 +347,14 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, *, show: Sequence[str] | None = None) -> Figure:
         """Draw the motion by `plot_motion`, and save the figure if a path is given."""
+        from fflin import plot_motion
+
         return plot_motion(self, path, show=show)
 
 
 def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
     return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
-
-
-def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
-) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, with the linear prediction.
-
-    Parameters
-    ----------
-    motion : Motion
-        Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot,
-        dashed lines show the linear model, and the panel below each group of states shows the
-        difference. If the robot follows a trajectory, pale lines show the reference, the panel
-        below each group shows the error, and a dotted line marks the time at which the reference
-        comes to rest.
-    path : str or Path, optional
-        File to which the figure is saved: .png, .pdf or .svg.
-    show : sequence of str, optional
-        States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``. By default, all states and inputs are drawn.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If `path` has another ending or the file cannot be written.
-    UnknownNameError
-        If a name in `show` matches no state or input.
-
-    Examples
-    --------
-    >>> robot = fflin.load("planar_detumble")
-    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
-    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
-    >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
-    """
-    from fflin.simulation.plots import draw_motion
-
-    return draw_motion(require_motion(motion), path, show)
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
