@@ -19,7 +19,7 @@ _PUBLIC = {
     },
     "Inputs": {
         "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel",
-        "robot.robot_files": "load_inputs",
+        "robot.loading": "load_inputs",
     },
     "Outputs": {
         "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "

@@ -24,7 +24,7 @@ from fflin.robot.inputs import BaseForce as BaseForce
 from fflin.robot.inputs import JointTorque as JointTorque
 from fflin.robot.inputs import Thruster as Thruster
 from fflin.robot.inputs import ReactionWheel as ReactionWheel
-from fflin.robot.robot_files import load_inputs as load_inputs
+from fflin.robot.loading import load_inputs as load_inputs
 
 # Outputs
 from fflin.robot.outputs import FullState as FullState
