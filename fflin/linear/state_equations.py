@@ -65,7 +65,7 @@ def assemble(
         # The columns of the base's linear velocity are zero, so they need no rotation.
         chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
-        actuation.turn_columns(chart, rates.by_u)
+        chart.turn_columns(actuation.held, rates.by_u)
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
@@ -157,7 +157,7 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        actuation.turn_columns(chart, by_u)
+        chart.turn_columns(actuation.held, by_u)
         D[:] = by_u  # (8.3)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
