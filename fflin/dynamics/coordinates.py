@@ -144,10 +144,6 @@ class Chart:
         """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
         return 0.5 * omega if self.standing else times(self.N, omega)
 
-    def rotated(self, vectors: Array) -> Array:
-        """Rotate vectors (.., 3) from base axes to reference axes."""
-        return vectors if self.standing else times(self.R, vectors)
-
     def turned(self, columns: Array) -> Array:
         """Rotate columns (.., 3, k) from base axes to reference axes."""
         return columns if self.standing else product(self.R, columns)

@@ -39,7 +39,8 @@ def assemble(
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    f0 = np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], rates.c), -1)  # (4.8)
+    position_rate = chart.turned(v[..., None])[..., 0]
+    f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)  # (4.8)
 
     theta = _over_rotations(state, actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
