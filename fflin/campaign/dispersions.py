@@ -25,7 +25,7 @@ from fflin.control.policies import Allocation, Policy, StateFeedback, bound, dec
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import Tree
+from fflin.kernel.tree import batch_tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
@@ -317,9 +317,11 @@ class Dispersions:
         late = self._of("delay", drawn)[:, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
-    def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
+    def in_lanes(self, drawn: Array) -> dict[str, Array]:
         """Return the arrays of the compiled loop that vary between runs."""
         plant, (q, v), count = self._plant, self.starts(drawn), len(drawn)
+        tree = batch_tree(plant.robot)
+        assert tree is not None
         runs = {"q": q, "nu": plant.state.velocities(v), **self._springs(drawn)}
         if faults := self._faults(drawn):
             runs |= faults._asdict()

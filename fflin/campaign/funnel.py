@@ -438,7 +438,7 @@ def _tested(
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
         starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
-        return completed(job, lambda a, b: starts[a:b], len(e), how)["outcome"]
+        return completed(job, starts, how)["outcome"]
 
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
     reach = [
