@@ -124,8 +124,7 @@ class LinearBatch(FrozenArrays):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models that are not fields of the batch: the same at all points, or taken from
-    # the robot.
+    # Further fields of the models: the same at all points, or taken from the robot.
     _asked: Mapping[str, object]
     verified: bool = True
 
@@ -312,7 +311,7 @@ class LinearBatch(FrozenArrays):
         common = Prepared(
             robot, frame=found["frame"], reference=None, moving=found["moving"]
         ).common
-        return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
+        return LinearBatch(**found, _asked=common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
         """Return all arrays with one row per point, by name."""
@@ -322,13 +321,13 @@ class LinearBatch(FrozenArrays):
     def header(self, count: int) -> dict[str, str]:
         """Return the header for a file with `count` points, as one JSON document."""
         first = self[0]
-        header = {key: getattr(self, key) for key in _TEXTS}
+        header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common: dict[str, object] = dict.fromkeys(_MODEL)  # None unless it is set below
-        common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
+        common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
+        common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
@@ -339,7 +338,7 @@ class LinearBatch(FrozenArrays):
         rows["y0"] = rows.pop("_y0", rows["x0"])
         if self._reference is None:
             rows["_reference"] = _in_world(root, rows["q"][:7])
-        return LinearModel({**common, **rows, **self._asked})
+        return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:
         q_m = positions(q, self.columns)
@@ -354,18 +353,13 @@ class LinearBatch(FrozenArrays):
         return {self.joint_names.index(name): value for name, value in joints.items()}
 
 
-# Names of a batch's fields by kind, in order. The fields in _TEXTS are the same at all points and
+# Names of a batch's fields by kind, in order. The fields in TEXTS are the same at all points and
 # are stored in the header of a file. Arrays have one row per point.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
 _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None"]
-_TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
-
-
-def fields_of_model(common: Mapping[str, object]) -> dict[str, object]:
-    """Return the fields that are the same for all models and are not fields of a batch."""
-    return {key: value for key, value in common.items() if key not in _KINDS}
+TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
 def _checked_fields(
@@ -381,7 +375,7 @@ def _checked_fields(
         if array.dtype != np.float64 or len(array) != count:
             raise ValueError(f"{key} has {len(array)} rows of {array.dtype}, expected {count}")
         found[key] = frozen(array)
-    for key in _TEXTS:
+    for key in TEXTS:
         found[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
     found["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
     nx, nu, ny = (len(found[f"{kind}_names"]) for kind in ("state", "input", "output"))

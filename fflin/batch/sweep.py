@@ -30,7 +30,7 @@ from fflin.batch.configurations import (
     content,
 )
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
-from fflin.batch.linear_batch import AT_ROOT, LinearBatch, fields_of_model
+from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
@@ -385,13 +385,10 @@ class SweepTask:
             rows[key] = np.broadcast_to(value, (count, *value.shape))
         for key in self.shapes:
             rows[key] = frozen(arrays[key].view())
-        common = dict(self.job.linearizer.prepared.common)
-        asked = fields_of_model(common)
-        texts = {
-            key: value for key, value in common.items() if key not in asked.keys() | {"C", "D"}
-        }
+        common = self.job.linearizer.prepared.common
+        rows |= {key: common[key] for key in TEXTS}
         columns = tuple(map(column, self.robot.joints))
-        return LinearBatch(**texts, **rows, columns=columns, _asked=asked)
+        return LinearBatch(**rows, columns=columns, _asked=common)
 
     def texts(self) -> dict[str, str]:
         """Return the strings that a file of the batch contains."""

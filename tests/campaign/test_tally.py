@@ -130,7 +130,7 @@ def as_lists(value):
         return type(value)._make(map(as_lists, value))
     if not isinstance(value, np.ndarray):
         return value
-    return value[:, 0].tolist() if value.ndim == 2 else value.tolist()
+    return (value[:, :1].ravel() if value.ndim == 2 else value).tolist()
 
 
 @pytest.mark.compiled
