@@ -311,6 +311,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
     steered -= set() if pushed(plant.actuation) else {"r_b"}
     groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
     return {
+        "kind": "Campaign",
         "names": job.dispersions.names,
         "state_names": plant.state.names,
         "state_units": plant.state.units,

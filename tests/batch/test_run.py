@@ -87,8 +87,8 @@ def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
 def test_in_memory_the_error_has_what_is_made_of_the_rest():
     store = MemoryStore(COUNT, CHUNK, STORED)
     with (
-        any_wording(),
         pytest.warns(fflin.FflinWarning, match="tired"),
+        any_wording(),
         pytest.raises(fflin.SweepError) as caught,
     ):
         run_chunks(Walks(endless=20), seeds, store, ALONE, made=lambda rows: rows["seed"])
