@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import NOT_VERIFIED, reading
@@ -212,9 +213,8 @@ class LinearBatch(FrozenArrays):
             If a value is not a finite number, or no value is given.
         """
         distance = np.zeros(len(self))
-        for index, value in self._named(joints).items():
-            target = number(f"joint '{self.joint_names[index]}'", value)
-            distance += away(self.q, self.columns[index], target) ** 2
+        for what, column, value in self._named(joints):
+            distance += away(self.q, column, number(what, value)) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -228,14 +228,13 @@ class LinearBatch(FrozenArrays):
             If a value is not a number or a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
-        for index, value in self._named(joints).items():
-            what = f"joint '{self.joint_names[index]}'"
+        for what, column, value in self._named(joints):
             if isinstance(value, tuple | list):
                 low, high = vector(what, value, 2, "(low, high)")
-                at = values(self.q, self.columns[index])
+                at = values(self.q, column)
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, self.columns[index], number(what, value)) <= _SAME
+                mask &= away(self.q, column, number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
@@ -337,7 +336,10 @@ class LinearBatch(FrozenArrays):
         )
         rows["y0"] = rows.pop("_y0", rows["x0"])
         if self._reference is None:
-            rows["_reference"] = _in_world(root, rows["q"][:7])
+            rows["_reference"] = base = rows["q"][:7]
+            if (root != AT_ROOT).any():
+                placed = pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)
+                rows["_reference"] = frozen(pin.SE3ToXYZQUAT(placed))
         return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:
@@ -346,11 +348,13 @@ class LinearBatch(FrozenArrays):
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, object]) -> dict[int, Any]:
+    def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Column, Any]]:
+        """Return for each named joint: its name in messages, its column and its given value."""
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
-        return {self.joint_names.index(name): value for name, value in joints.items()}
+        columns = dict(zip(self.joint_names, self.columns, strict=True))
+        return [(f"joint '{name}'", columns[name], value) for name, value in joints.items()]
 
 
 # Names of a batch's fields by kind, in order. The fields in TEXTS are the same at all points and
@@ -395,12 +399,3 @@ def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
         f"the {what} is computed from the robot, which the file does not contain; load the batch "
         f"with LinearBatch.load(path, robot), where robot is the unchanged '{name}'"
     )
-
-
-def _in_world(root: Array, base: Array) -> Array:
-    """Return the world placement (7,) of a base from its placement (7,) in the root's frame."""
-    import pinocchio as pin
-
-    if (root == AT_ROOT).all():
-        return base
-    return frozen(pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)))

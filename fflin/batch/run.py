@@ -12,15 +12,7 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
@@ -78,7 +70,7 @@ class Execution:
 
     def __init__(
         self,
-        executor: Executor | None = None,
+        executor: futures.Executor | None = None,
         workers: int | None = None,
         threads: int | None = None,
         chunk: int | None = None,
@@ -86,7 +78,8 @@ class Execution:
     ) -> None:
         if executor is not None and workers is not None:
             raise InputError("executor and workers are both given; give only one of them")
-        instance("executor", executor, (Executor, NoneType), "a concurrent.futures.Executor")
+        kinds = futures.Executor, NoneType
+        instance("executor", executor, kinds, "a concurrent.futures.Executor")
         for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
             if value is not None:
                 whole(name, value, 1)
@@ -179,15 +172,15 @@ def _results(
         for span in spans:
             yield span, here(*span)
         return
-    pool = how.executor or ThreadPoolExecutor(count)
+    pool = how.executor or futures.ThreadPoolExecutor(count)
     pickled = b"" if inside else pickle.dumps(job)
 
-    def submit(start: int, stop: int) -> Future[Result | str]:
+    def submit(start: int, stop: int) -> futures.Future[Result | str]:
         if inside:
             return pool.submit(here, start, stop)
         return pool.submit(work, pickled, rows(start, stop), start, stop)
 
-    waiting, running = deque(spans), dict[Future[Result | str], Span]()
+    waiting, running = deque(spans), dict[futures.Future[Result | str], Span]()
     try:
         while waiting or running:
             # Results wait in memory until they are consumed, so their number is limited.
@@ -197,9 +190,10 @@ def _results(
                     running[submit(*span)] = span
                 except Exception as error:  # broken, shut down, or specific to the executor
                     yield span, _reason(error)
-            # Chunks of this process end in order.
-            first = list(running)[:1]
-            for future in first if inside else wait(running, return_when=FIRST_COMPLETED).done:
+            ready = list(running)[:1]  # chunks of this process end in order
+            if not inside:
+                ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
+            for future in ready:
                 span = running.pop(future)
                 try:
                     result = future.result()
@@ -270,7 +264,7 @@ def _failure(
     return SweepError(message, tuple(failed), batch)
 
 
-class OwnWorkers(ThreadPoolExecutor):
+class OwnWorkers(futures.ThreadPoolExecutor):
     """Executor with worker processes; if one dies, its task fails and another one starts.
 
     Each thread has a pool of one process, so that the others continue if a process dies.
@@ -283,10 +277,10 @@ class OwnWorkers(ThreadPoolExecutor):
             warnings.warn(said, FflinWarning, stacklevel=4)
         super().__init__(min(count, cores))
         self._mine, self._lock = local(), Lock()
-        self._pools: list[ProcessPoolExecutor] = []
+        self._pools: list[futures.ProcessPoolExecutor] = []
         self._ended = ""  # reason why no further process can start
 
-    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
         """Call a function in a worker process; raise `FflinError` if the process dies."""
         return super().submit(self._do, partial(fn, *args, **kwargs))
 
@@ -307,13 +301,13 @@ class OwnWorkers(ThreadPoolExecutor):
         pool = getattr(self._mine, "pool", None) or self._start()
         try:
             return pool.submit(task).result()
-        except BrokenExecutor:
+        except futures.BrokenExecutor:
             self._mine.pool = None
             raise FflinError(
                 "a worker process died, for example because the memory was full"
             ) from None
 
-    def _start(self) -> ProcessPoolExecutor:
+    def _start(self) -> futures.ProcessPoolExecutor:
         """Start a process for this thread and wait until it is ready."""
         try:
             with self._lock:
@@ -322,13 +316,13 @@ class OwnWorkers(ThreadPoolExecutor):
                 with _starting():
                     # With fork, a process would inherit locks that other threads hold, and could
                     # wait for them forever.
-                    pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare)
+                    pool = futures.ProcessPoolExecutor(1, get_context("spawn"), _prepare)
                     ready = pool.submit(int)
                 self._pools.append(pool)
             ready.result()
         except OSError as error:
             self._ended = f"no worker process can be started: {error}"
-        except BrokenExecutor:
+        except futures.BrokenExecutor:
             self._ended = (
                 'a worker process did not start; make the call under `if __name__ == "__main__":`'
             )

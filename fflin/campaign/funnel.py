@@ -170,22 +170,24 @@ class Funnel(Design):
     @cached_property
     def attitude(self) -> Array:
         """Half-axes (m, 3) of the ellipsoids in base attitude [deg]."""
-        sines = np.array([_half_axes(W[:3]) for W in self._roots])
+        sines = np.linalg.svd(self._roots[:, :3], compute_uv=False)
         return np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
 
     @cached_property
     def position(self) -> Array:
         """Half-axes (m, 3) of the ellipsoids in base position [m]."""
-        return np.array([_half_axes(W[3:6]) for W in self._roots])
+        half: Array = np.linalg.svd(self._roots[:, 3:6], compute_uv=False)
+        return half
 
     @cached_property
     def joints(self) -> Array:
         """Half-axes (m, n) of the ellipsoids in each joint [rad|m]."""
-        return np.array([np.linalg.norm(W[6 : 6 + self.robot.n], axis=1) for W in self._roots])
+        half: Array = np.linalg.norm(self._roots[:, 6 : 6 + self.robot.n], axis=2)
+        return half
 
     @cached_property
-    def _roots(self) -> list[Array]:
-        return [self.root(t) for t in self.t.tolist()]
+    def _roots(self) -> Array:
+        return np.array([self.root(t) for t in self.t.tolist()])
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -272,11 +274,6 @@ class Funnel(Design):
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
         """Read a funnel of a robot from a file that `save` wrote; see `Gain.load` for errors."""
         return cls._read(as_path(path), robot=robot)
-
-
-def _half_axes(W: Array) -> Array:
-    """Return the half-axes (3,) of the image of the unit sphere under W (3, nx)."""
-    return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
 def funnel(
@@ -387,7 +384,8 @@ def funnel(
             tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
             if progress:
                 progress(knot + 1, len(jobs))
-    return Funnel(
+    return Funnel._of(
+        motion,
         robot=robot,
         t=np.array([motion.t[k] for k, _ in indices]),
         tried=tried,
@@ -398,7 +396,6 @@ def funnel(
         at=by.t - by.t[0] + motion.t[0],
         P=by.P,
         knots=motion.t,
-        **{name: getattr(motion, name) for name in ("q", "v", "u", "hold", "frame", "verified")},
     )
 
 
