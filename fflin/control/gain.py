@@ -7,23 +7,28 @@ import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
-from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Values
 from fflin.control.optimal.riccati import Solution, rates_of
+from fflin.dynamics.coordinates import frame_of
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.fit import require_same
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     import control
+    import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
+    from fflin.robot.robot import Robot
 
 # A gain with more entries than this, as for a robot with more than three joints, is not shown.
 _LARGE = 9 * 18
@@ -117,10 +122,7 @@ class Gain(Design):
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
-    def __repr__(self) -> str:
-        return titled(self, nx=self.K.shape[1], nu=len(self.K))
-
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return the report: the gain, its poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
@@ -145,14 +147,15 @@ class Gain(Design):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        parts = [
-            f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
-            f"K ({nu} x {nx}){shown}",
-            _poles(self),
-            fold(figures),
-            *(fold(f"{what}: {said}") for what, said in more.items() if said),
-        ]
-        return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
+        return "\n\n".join(
+            (
+                f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
+                f"K ({nu} x {nx}){shown}",
+                _poles(self),
+                fold(figures),
+                *(fold(f"{what}: {said}") for what, said in more.items() if said),
+            )
+        )
 
     @property
     def closed_loop(self) -> Array:
@@ -195,16 +198,20 @@ class Gain(Design):
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
-def titled(record: Any, **sizes: int) -> str:
-    """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
-    time = f"dt={record.dt:g} s" if record.dt else "continuous"
-    parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
-    parts += [
-        f"{key}={getattr(record, key):{form}}"
-        for key, form in (("margin", ".3g"), ("residual", ".1e"))
-        if hasattr(record, key)
-    ]
-    return f"{type(record).__name__}({', '.join(parts)})"
+def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
+    """Return the model of a robot at the point stored with a gain, relative to a reference.
+
+    If the robot has other states or inputs than the gain, the error begins with the text `made`.
+    """
+    from fflin.linear.linearization import linearize
+
+    frame = frame_of(robot, gain.frame)
+    state = StateMap(robot, reference=reference, frame=frame)
+    for kind, there in (("state", state), ("input", Actuation(state))):
+        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
+        require_same(made, robot, kind, own, (there.names, there.units))
+    q, v = state.to_pinocchio(gain.x0)
+    return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
 
 def make_gain(

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
+from fflin.analysis.controllability import require_detectable, require_disturbed
 from fflin.analysis.reduction import outputs_of, regulated_part, selection
-from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.record import Design
 from fflin.base.validation import Array, Values, dimension, instance, number
-from fflin.control.gain import Gain, titled
+from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
@@ -102,9 +102,6 @@ class Estimator(Design):
     robot: str
     estimated: tuple[str, ...]
 
-    def __repr__(self) -> str:
-        return titled(self, nx=len(self.L), ny=self.L.shape[1])
-
     def to_control(self) -> control.StateSpace:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
@@ -162,9 +159,6 @@ class Compensator(Design):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     robot: str
-
-    def __repr__(self) -> str:
-        return titled(self, nx=len(self.B), ny=self.B.shape[1], nu=len(self.C))
 
     def to_control(self) -> control.StateSpace:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.

@@ -14,11 +14,11 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.record import Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain, titled
+from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
@@ -122,14 +122,9 @@ class GainSchedule(Schedule):
     hold: str
     frame: str
 
-    def __repr__(self) -> str:
-        return titled(self, knots=len(self.t), nx=self.K.shape[2], nu=self.K.shape[1])
-
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return the report: the sizes, the residual and the rule of the weights."""
-        verdict = [] if self.verified else [NOT_VERIFIED]
-        said = [repr(self), f"weights: {self.weights or 'as given'}", *verdict]
-        return "\n".join(folded([each]) for each in said)
+        return folded([repr(self), f"weights: {self.weights or 'as given'}"])
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that the gains were designed for."""
@@ -253,9 +248,6 @@ class FilterSchedule(Schedule):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     robot: str
-
-    def __repr__(self) -> str:
-        return titled(self, knots=len(self.t), nx=self.L.shape[1], ny=self.L.shape[2])
 
     def gain(self, t: float) -> Array:
         """Return L (nx, ny) of the most recent sample at time t."""
