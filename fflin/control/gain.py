@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import textwrap
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,31 @@ _FRAGILE = 0.3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Gain(Design):
+class ModelDesign(Design):
+    """Design for a linear model x' = A x + B u; the model is sampled if dt [s] is not 0."""
+
+    # Sizes in the one-line title, with the fields that they count.
+    SIZES: ClassVar[Mapping[str, str]] = {"nx": "state_names", "nu": "input_names"}
+
+    A: Array
+    B: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    robot: str
+
+    def __repr__(self) -> str:
+        parts = [f"'{self.robot}'"]
+        parts += [f"{size}={len(getattr(self, of))}" for size, of in self.SIZES.items()]
+        parts.append(f"dt={self.dt:g} s" if self.dt else "continuous")
+        for key, form in (("margin", ".3g"), ("residual", ".1e")):
+            if hasattr(self, key):
+                parts.append(f"{key}={getattr(self, key):{form}}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gain(ModelDesign):
     r"""State-feedback gain ``u = u0 - K (x - x0)`` with its residual, poles and margins.
 
     Attributes
@@ -96,29 +121,20 @@ class Gain(Design):
     residual: float
     margin: float
     method: str
-    A: Array
-    B: Array
     Q: Array
     R: Array
     N: Array
     x0: Array
     u0: Array
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_units: tuple[str, ...]
     frame: str
-    robot: str
     weights: str
     regulated: tuple[str, ...]
     placement: Array
     urdf_sha256: str
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
-
-    def __repr__(self) -> str:
-        return titled(self, nx=self.K.shape[1], nu=len(self.K))
 
     def __str__(self) -> str:
         """Return the report: the gain, its poles, residual, margins, weights and warnings."""
@@ -129,12 +145,17 @@ class Gain(Design):
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
-        fold = partial(textwrap.fill, width=width())
+        left = [name for name in self.state_names if self.regulated and name not in self.regulated]
+        why = (
+            "(not reached by any input, or determined by other states; "
+            "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
+        )
         more = {
-            "not regulated": _unregulated(self),
+            "not regulated": f"{listed(left)} {why}" if left else "",
             "weights": self.weights,
             "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
         }
+        fold = partial(textwrap.fill, width=width())
         rates, margins = rates_of(self.poles, self.dt), self.margins
         result = (
             f"{len(self.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
@@ -191,20 +212,23 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
+        # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler,
+        # Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues
+        # of Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems
+        # and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)
-        return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
-
-
-def titled(record: Any, **sizes: int) -> str:
-    """Return a one-line title: the robot, the sizes, the sampling time and the residual."""
-    time = f"dt={record.dt:g} s" if record.dt else "continuous"
-    parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
-    parts += [
-        f"{key}={getattr(record, key):{form}}"
-        for key, form in (("margin", ".3g"), ("residual", ".1e"))
-        if hasattr(record, key)
-    ]
-    return f"{type(record).__name__}({', '.join(parts)})"
+        scale = np.sqrt(self.R.diagonal())
+        F, G, H = S @ self.closed_loop @ S.T, S @ self.B / scale, -scale[:, None] * self.K @ S.T
+        D = 0.5 * np.eye(len(H))
+        if self.dt:
+            # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
+            inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
+            D = D - H @ inverse @ G
+            F, G, H = inverse @ (F - unit), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
+        disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
+        most = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf
+        phase = math.degrees(2.0 * math.atan(disk / 2.0))
+        return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
 
 
 def make_gain(
@@ -269,17 +293,6 @@ def one_sided(gain: Gain) -> str:
     )
 
 
-def _unregulated(gain: Gain) -> str:
-    """Return the states that are not fed back, with the reasons."""
-    left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
-    if not left:
-        return ""
-    return (
-        f"{listed(left)} (not reached by any input, or determined by other states; "
-        "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
-    )
-
-
 def _poles(gain: Gain) -> str:
     """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
     poles = gain.poles[gain.poles.imag >= 0.0]
@@ -316,24 +329,6 @@ class Margins(NamedTuple):
     disk: float
     gain: tuple[float, float]
     phase: float
-
-
-def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
-    """Return the margins at the inputs of a stable loop u = -K x, accurate to five digits."""
-    # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler, Packard
-    # and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues of
-    # Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems and
-    # Control Letters 14(4), 1990.
-    scale = np.sqrt(R.diagonal())
-    F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
-    if dt:
-        # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
-        inverse = np.linalg.inv(F + np.eye(len(F)))
-        D = D - H @ inverse @ G
-        F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
-    disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
-    gain = ((2.0 - disk) / (2.0 + disk), (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf)
-    return Margins(disk, gain, math.degrees(2.0 * math.atan(disk / 2.0)))
 
 
 def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:

@@ -14,11 +14,11 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.record import NOT_VERIFIED
 from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain, titled
+from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
@@ -35,12 +35,12 @@ from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Schedule(Design):
+class Schedule(ModelDesign):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
     t: Array
     P: Array
-    dt: float
+    residual: float
 
     @cached_property
     def starts(self) -> list[float]:
@@ -103,17 +103,12 @@ class GainSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t", "knots")
+    SIZES: ClassVar = {"knots": "t", "nx": "state_names", "nu": "input_names"}
 
     K: Array
-    A: Array
-    B: Array
     Q: Array
     R: Array
     Qf: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    robot: str
     weights: str
     knots: Array
     q: Array
@@ -121,9 +116,6 @@ class GainSchedule(Schedule):
     u: Array
     hold: str
     frame: str
-
-    def __repr__(self) -> str:
-        return titled(self, knots=len(self.t), nx=self.K.shape[2], nu=self.K.shape[1])
 
     def __str__(self) -> str:
         """Return the report: the sizes, the residual and the rule of the weights."""
@@ -239,23 +231,15 @@ class FilterSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t",)
+    SIZES: ClassVar = {"knots": "t", "nx": "state_names", "ny": "output_names"}
 
     L: Array
-    A: Array
-    B: Array
     C: Array
     D: Array
     y: Array
     W: Array
     V: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    robot: str
-
-    def __repr__(self) -> str:
-        return titled(self, knots=len(self.t), nx=self.L.shape[1], ny=self.L.shape[2])
 
     def gain(self, t: float) -> Array:
         """Return L (nx, ny) of the most recent sample at time t."""
