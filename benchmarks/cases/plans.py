@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import fflin
 from benchmarks.peers import WrongResultError
 from benchmarks.tables import Table, figure
-from fflin.control.horizon import Receding
+from fflin.control.mpc import Receding
 
 SAMPLES, STEP, DURATION = 20, 0.1, 30.0
 SLEWS = {
