@@ -242,18 +242,14 @@ def make_gain(
 ) -> Gain:
     """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
-    poles, margin = solution.ordered(lin.dt)
     return Gain._of(
+        solution,
         lin,
         K=solution.K @ S,
         P=S.T @ solution.P @ S,
         Q=S.T @ Q @ S,
         R=R,
         N=np.zeros(lin.B.shape) if N is None else S.T @ N,
-        poles=poles,
-        margin=margin,
-        residual=solution.residual,
-        method=solution.method,
         weights=weights,
         regulated=part.state_names,
         _lin=lin,

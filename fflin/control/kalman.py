@@ -247,15 +247,12 @@ def kalman(
     L = L_update = solution.K.T
     if lin.dt:
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
-    poles, margin = solution.ordered(lin.dt)
     return Estimator._of(
+        solution,
         whole,
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
         P=S.T @ solution.P @ S,
-        poles=poles,
-        residual=solution.residual,
-        margin=margin,
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,
