@@ -1,20 +1,23 @@
-"""Controllability of a linear model, with the names of the uncontrollable states."""
+"""Controllability of a linear model, and errors about states that a design cannot reach."""
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from fflin.analysis import mechanics
+from fflin.analysis import mechanics, ranks
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.mechanics import ConservedMomenta, combination
-from fflin.analysis.ranks import (
-    FixedPoles,
-    Margin,
-    Noisy,
-    echelon,
-    image,
-    null_space,
-    unit_columns,
+from fflin.analysis.observability import observability
+from fflin.base.errors import (
+    DetectabilityError,
+    FflinError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    listed,
 )
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, Values
@@ -24,6 +27,10 @@ _LOOPS = (
     "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
     "joint amplitude e, although the linear model does not show it"
 )
+
+# Relative singular values of the equilibrated Popov-Belevitch-Hautus matrix below this count as
+# zero, because repeated eigenvalues have errors of this size.
+_RANK = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +89,7 @@ class Controllability(FrozenArrays):
     stabilizable: bool
     reach: dict[str, int]
     method: str
-    margin: Margin
+    margin: ranks.Margin
     notes: tuple[str, ...]
     robot: str
 
@@ -174,23 +181,23 @@ def controllability(lin: LinearModel) -> Controllability:
     if found is None:
         z, R = conserved.selected, conserved.rates
         X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
-        split = split_by_poles(X, lin.B[z], M, lin.dt)
-        found = split.inside, split.rows, None, "eigenvalues", split.fixed.transformed(R)
+        inside, _, rows, fixed = split_by_poles(X, lin.B[z], M, lin.dt)
+        found = inside, rows, None, "eigenvalues", fixed.transformed(R)
     controllable, rows, names, method, fixed = found
     if names is None:
         z = conserved.selected
-        rows = echelon(rows.T, 1.0 / size[z])[0].T
+        rows = ranks.echelon(rows.T, 1.0 / size[z])[0].T
         states = tuple(lin.state_names[i] for i in z)
         names = [combination(row, states, 1.0 / size[z]) for row in rows]
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, conserved.selected] = rows
     # When the controllable states are named, prefer coordinates on which an input acts directly.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
-    basis, pivots = echelon(conserved.T @ controllable, size, np.tile(driven, 2))
+    basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
     fixed = fixed._replace(margin=conserved.margin & fixed.margin)
     if len(zero):
-        fixed = fixed._replace(decays=False, settling=Margin())
+        fixed = fixed._replace(decays=False, settling=ranks.Margin())
     groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
     weighted = (basis * size[:, None])[: len(groups)]
@@ -215,7 +222,7 @@ def controllability(lin: LinearModel) -> Controllability:
         fixed_poles=np.concatenate((zero, fixed.poles)),
         stabilizable=fixed.decays,
         reach={
-            title: image(unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
+            title: ranks.image(ranks.unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
             for group, title in titles.items()
             if group in groups
         },
@@ -228,7 +235,7 @@ def controllability(lin: LinearModel) -> Controllability:
 
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
-) -> tuple[Array, Array, list[str] | None, str, FixedPoles] | None:
+) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
     """Split the 2 r states without conserved momenta at rest; None if the test is inconclusive.
 
     Return a basis (2 r, d) of the controllable subspace, rows (2 r - d, 2 r) on which no input
@@ -238,18 +245,21 @@ def _by_second_order(
     if source is None:
         return None
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
-    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
+    idle, margin = ranks.null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
-        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
+        everything, margin = np.eye(2 * r), margin.transformed(R / system.size)
+        fixed = ranks.FixedPoles(margin=margin)
         return everything, everything[:0], [], "closed form", fixed
-    found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
+    S = system.S.T
+    found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
     # The system is symmetric. Each motion (s, v) that the output S^T s does not observe therefore
     # gives a row, a combination of states on which no input acts.
-    s, v = np.split(found.motions, 2)
+    motions, shapes, fixed = found
+    s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.
     size = np.tile(system.size, 2)
@@ -260,7 +270,7 @@ def _by_second_order(
         (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
     )
     controllable[:r] = np.linalg.solve(to_s, controllable[:r])
-    fixed = found.fixed.transformed(R)
+    fixed = fixed.transformed(R)
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed
@@ -268,15 +278,147 @@ def _by_second_order(
     # drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
-    for pole, shapes in found.shapes:
+    for pole, of_pole in shapes:
         if pole.real < 0.0:  # the pole with positive real part has the same shapes
             continue
-        momenta = shapes.real.T @ system.M
+        momenta = of_pole.real.T @ system.M
         zero = np.zeros_like(momenta)
         read += [np.hstack((momenta @ to_s, zero)), np.hstack((zero, momenta))]
         kind = "vibration" if pole.imag else "instability"
         for what in ("", "rate of "):
-            for each in shapes.real.T * system.size:
+            for each in of_pole.real.T * system.size:
                 shape = combination(each / np.abs(each).max(), members, np.ones(r))
                 names.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
     return controllable, np.vstack(read), names, "modes", fixed
+
+
+def require_stabilizable(lin: LinearModel) -> None:
+    """Raise `StabilizabilityError` if there are states that the inputs cannot stabilise."""
+    missed = "the inputs cannot stabilise {}; add inputs"
+    if len(lin.A) < 2 * len(lin.M):  # the model has wheel speeds without wheel angles
+        robot = lin._robot
+        if robot and any(robot.damping.get(name) for name in robot.wheels):
+            missed += ", or remove the damping of the wheels"
+        said = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
+        return _conclude(StabilizabilityError, *said)
+    found, words = controllability(lin), ""
+    if not found.stabilizable:
+        # Name the momenta and the other states, but not the coordinates whose rates are the
+        # momenta.
+        count = len(mechanics.conserved(lin).weights)
+        lost = (*found.uncontrollable[:count], *found.uncontrollable[2 * count :])
+        words = missed.format(listed(mechanics.grouped(lost)))
+        if count:
+            words += (
+                ", add a spring to any joint that no input moves (--stiffness, stiffness=), or "
+                "design on fflin.momentum_reduction(lin)"
+            )
+    return _conclude(StabilizabilityError, words, found.notes, found.margin)
+
+
+def require_detectable(lin: LinearModel) -> None:
+    """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
+    missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
+    if len(lin.A) < 2 * len(lin.M):
+        said = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
+        return _conclude(DetectabilityError, *said)
+    found = observability(lin)
+    words = "" if found.detectable else missed.format(listed(found.unobservable))
+    return _conclude(DetectabilityError, words, found.notes, found.margin)
+
+
+def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
+    """Raise `InputError` if a marginally stable mode has no weight in Q."""
+    missed = "Q has no weight on {}, whose motion does not decay by itself; add a weight there"
+    _conclude(InputError, *_reached(lin, A.T, _root(Q), "weighted by Q", missed))
+
+
+def require_disturbed(lin: LinearModel, W: Array) -> None:
+    """Raise `InputError` if no disturbance excites a marginally stable mode."""
+    missed = (
+        "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
+        "would not correct its estimate; give the noise there a positive intensity"
+    )
+    _conclude(InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed))
+
+
+def _conclude(
+    kind: type[FflinError], words: str, notes: Sequence[str], margin: ranks.Margin
+) -> None:
+    """Raise an error with `words` and the undecided ranks; without `words`, warn of these ranks."""
+    doubts = [note for note in notes if note.startswith("undecided")]
+    if words:
+        error: Any = kind("; ".join((words, *doubts)))
+        error.margin = margin
+        raise error
+    for note in doubts:
+        warnings.warn(note, FflinWarning, stacklevel=4)
+
+
+def _root(W: Array) -> Array:
+    """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
+    # The condition number of L is the square root of the condition number of W, so the rank of L is
+    # easier to decide.
+    size = np.sqrt(W.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(W / np.outer(size, size))
+    rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
+    return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+
+
+def _reached(
+    lin: LinearModel, A: Array, B: Array, what: str, complaint: str, *, unstable: bool = False
+) -> tuple[str, list[str], ranks.Margin]:
+    """Return words if B misses a mode on the stability boundary, undecided ranks, and the margin.
+
+    Modes beyond the boundary are tested if the design must stabilise `unstable` modes.
+    """
+    discrete = bool(lin.dt)
+    poles = np.linalg.eigvals(A)
+    size = max(float(np.abs(poles - discrete).max()), 1e-300)
+    beyond = np.abs(poles) - 1.0 if discrete else poles.real
+    # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
+    # rounding error. Poles closer than 1e-3 of the largest therefore count as equal.
+    candidates = [complex(discrete)]
+    growing = (beyond > 0.0) & unstable
+    for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
+        if all(abs(pole - other) > 1e-3 * size for other in candidates):
+            candidates.append(complex(pole))
+    missed, margin = list[Values](), ranks.Margin()
+    for pole in candidates:
+        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
+        matrix = np.column_stack((shifted, B))
+        # Rows and columns have different units, so they are scaled to comparable sizes.
+        rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
+        for _ in range(4):
+            sizes = np.sqrt(np.abs(scaled).max(axis=1))
+            rows /= np.where(sizes > 0.0, sizes, 1.0)
+            sizes = np.sqrt(np.abs(scaled).max(axis=0))
+            columns /= np.where(sizes > 0.0, sizes, 1.0)
+            scaled = rows[:, None] * matrix * columns
+        left, values, _ = np.linalg.svd(scaled)
+        vectors: Values = left.conj().T * rows
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        ratios = values / (_RANK * values[0])
+        rank = int((ratios > 1.0).sum())
+        missed += list(vectors[rank:])
+        margin &= ranks.judged(ratios, vectors.T, rank)
+    doubts = [
+        f"undecided: {_dominant(at[None], lin.state_names)} counts as "
+        f"{'' if change < 0 else 'not '}{what}, but the test value is only {ratio:.2g} times its "
+        "rounding error, so another machine may decide otherwise"
+        for ratio, at, change in margin.doubts
+    ]
+    words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
+    return words, doubts, margin
+
+
+def _dominant(vectors: Values, names: Sequence[str]) -> str:
+    """Name the largest states of vectors (k, nx), at least one for each vector."""
+    sizes = np.abs(vectors)
+    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
+    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+    count = len(vectors)
+    if large.sum() <= count:
+        return words
+    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -21,9 +20,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
 # counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
@@ -308,16 +305,38 @@ def modes(lin: LinearModel) -> Modes:
     lin = checked(lin)
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
-    (poles, shapes, margins), rigid_body, zeros, residual = _natural_modes(lin)
-    energies = energies_of(lin._robot, lin, shapes)
-    found = [
-        Mode(pole, shape, margin > 1.0, margin, *energy)
-        for pole, shape, margin, energy in zip(poles, shapes, margins, energies, strict=True)
-    ]
+    nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
+    # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
+    # this size are set to zero.
+    A = lin.A.copy()
+    by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
+    by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
+    # Scale the states and the time so that the largest entries of A are about 1.
+    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
+    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
+    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
+    weight = np.concatenate((fastest * inertia, inertia))
+    pairs, rigid_body = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
+    found, residual = list[Mode](), 0.0
+    for scaled_pole, vector, error in pairs:
+        if scaled_pole.imag < 0.0:
+            continue
+        oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
+        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
+        shape = vector / weight
+        left = weight * (A @ shape - pole * shape) / fastest
+        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
+        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
+        # those of symmetric panels, the shape is scaled by the first one.
+        positions = np.abs(shape[:nv])
+        largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
+        shape, margin = np.asarray(shape / shape[largest], complex), scaled_pole.real / error
+        energies = energies_of(lin._robot, lin, shape)
+        found.append(Mode(pole, shape, margin > 1.0, margin, *energies))
     return Modes(
         tuple(sorted(found, key=lambda mode: (abs(mode.pole), mode.pole.real))),
         rigid_body,
-        zeros,
+        2 * nv - len(pairs),
         residual,
         lin.is_equilibrium(),
         lin.state_names,
@@ -341,80 +360,35 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
 
 
 def energies_of(
-    robot: Robot | None, lin: LinearModel, shapes: Sequence[Complex]
-) -> list[tuple[Mapping[str, float], Mapping[str, float]]]:
+    robot: Robot | None, lin: LinearModel, shape: Complex
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} and {joint: fraction of the elastic energy}.
 
-    There is one pair for each of the shapes (nx,), see `Mode`. Without a robot, the mappings are
-    empty.
+    They belong to a mode with a shape (nx,), see `Mode`. Without a robot, they are empty.
     """
     if robot is None:
-        return [({}, {}) for _ in shapes]
+        return {}, {}
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart, data = state.chart(lin.q), robot.create_data()
     names = ("base", *list(robot.model.names)[ROOT + 1 :])
     inertias = robot.model.inertias.tolist()[ROOT:]
-    found = list[tuple[Mapping[str, float], Mapping[str, float]]]()
-    for shape in shapes:
-        moved = shape[: len(shape) // 2]
-        if isinstance(lin, ReducedModel):
-            moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
-        # Displacements in base axes. In a mode, all velocities are the displacements times the
-        # pole.
-        moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
-        kinetic = np.zeros(len(names))
-        for part in (moved.real, moved.imag):
-            pin.forwardKinematics(robot.model, data, lin.q, state.spread(part))
-            twists = data.v.tolist()[ROOT:]
-            kinetic += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
-        kinetic /= kinetic.sum() or 1.0
-        order = np.argsort(-kinetic.round(9), kind="stable").tolist()
-        energy = {names[i]: float(kinetic[i]) for i in order}
-        elastic = robot.springs.stiffness * np.abs(moved[6:]) ** 2
-        elastic /= elastic.sum() or 1.0
-        order = np.argsort(-elastic, kind="stable").tolist()
-        strain = {robot.joint_names[i]: float(elastic[i]) for i in order if elastic[i] > 0.0}
-        found.append((energy, strain))
-    return found
-
-
-def _natural_modes(
-    lin: LinearModel,
-) -> tuple[tuple[list[complex], list[Complex], list[float]], int, int, float]:
-    """Return the modes with nonzero poles, and the counts and residual that `Modes` reports.
-
-    The modes are their poles, with one of each conjugate pair, their shapes (nx,), and the real
-    parts of the poles as multiples of their rounding errors.
-    """
-    nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
-    # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
-    # this size are set to zero.
-    A = lin.A.copy()
-    by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
-    by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
-    # Scale the states and the time so that the largest entries of A are about 1.
-    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
-    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
-    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
-    weight = np.concatenate((fastest * inertia, inertia))
-    found, nullity = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
-    poles, shapes, margins, residual = list[complex](), list[Complex](), list[float](), 0.0
-    for scaled_pole, vector, error in found:
-        if scaled_pole.imag < 0.0:
-            continue
-        oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
-        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
-        shape = vector / weight
-        left = weight * (A @ shape - pole * shape) / fastest
-        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
-        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
-        # those of symmetric panels, the shape is scaled by the first one.
-        positions = np.abs(shape[:nv])
-        largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
-        poles.append(pole)
-        shapes.append(np.asarray(shape / shape[largest], dtype=complex))
-        margins.append(scaled_pole.real / error)
-    return (poles, shapes, margins), nullity, 2 * nv - len(found), residual
+    moved = shape[: len(shape) // 2]
+    if isinstance(lin, ReducedModel):
+        moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
+    # Displacements in base axes. In a mode, all velocities are the displacements times the pole.
+    moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
+    kinetic = np.zeros(len(names))
+    for part in (moved.real, moved.imag):
+        pin.forwardKinematics(robot.model, data, lin.q, state.spread(part))
+        twists = data.v.tolist()[ROOT:]
+        kinetic += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
+    kinetic /= kinetic.sum() or 1.0
+    order = np.argsort(-kinetic.round(9), kind="stable").tolist()
+    energy = {names[i]: float(kinetic[i]) for i in order}
+    elastic = robot.springs.stiffness * np.abs(moved[6:]) ** 2
+    elastic /= elastic.sum() or 1.0
+    order = np.argsort(-elastic, kind="stable").tolist()
+    return energy, {robot.joint_names[i]: float(elastic[i]) for i in order if elastic[i] > 0.0}
 
 
 def nonzero_eigenpairs(

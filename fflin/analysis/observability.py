@@ -121,12 +121,13 @@ def observability(lin: LinearModel) -> Observability:
         position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
         found = unobservable(system, position, velocity, lin.dt)
     if source is not None and found is not None:
-        motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
-        fixed, method = found.fixed, "eigenvalues" if system.acting else "closed form"
+        motions, _, fixed = found
+        motions = np.vstack((N @ motions[:nv], motions[nv:]))
+        method = "eigenvalues" if system.acting else "closed form"
     else:
         # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
-        part = split_by_poles(mechanics.rate_matrix(lin), lin.C.T, lin.M, lin.dt, dual=True)
-        motions, fixed, method = part.outside, part.fixed, "eigenvalues"
+        X, method = mechanics.rate_matrix(lin), "eigenvalues"
+        _, motions, _, fixed = split_by_poles(X, lin.C.T, lin.M, lin.dt, dual=True)
     basis, _ = echelon(motions, size)
     nx, count = basis.shape
     complement = np.linalg.qr(basis * size[:, None], mode="complete")[0][:, count:]

@@ -31,7 +31,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from fflin.base.errors import FileError, InputError
-from fflin.base.validation import FrozenArrays
+from fflin.base.validation import Result
 from fflin.base.writing import (
     as_path,
     check_ending,
@@ -48,7 +48,6 @@ Record = dict[str, Any]
 Kind = TypeVar("Kind", bound="Design")
 
 DAMAGED = f"its content does not match its {CHECKSUM}: the file was damaged or edited"
-NOT_VERIFIED = f"not verified: the file has no {CHECKSUM}, so that damage cannot be detected"
 
 _BLOCK = 2**22
 _LARGEST = 1e300
@@ -250,7 +249,7 @@ FORMATS = tuple(_CODECS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Design(FrozenArrays):
+class Design(Result):
     """Result of arrays, names and numbers that can be saved and loaded; its arrays are read-only.
 
     Attributes
@@ -267,9 +266,6 @@ class Design(FrozenArrays):
     OPEN: ClassVar[tuple[str, ...]] = ()
 
     verified: bool = field(default=True, kw_only=True)
-
-    def __str__(self) -> str:
-        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     def save(self, path: str | Path) -> None:
         """Write the result to a .npz, .mat or .json file; the file is written atomically.

@@ -32,6 +32,8 @@ T = TypeVar("T")
 # this, because the difference is rounding error. A larger difference is an error in the input.
 NORM_TOLERANCE = 1e-6
 
+NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
+
 # Native double precision. NumPy has only one native float64 type, so `is` can replace a comparison.
 DOUBLE = np.dtype(np.float64)
 
@@ -190,6 +192,45 @@ class FrozenArrays:
             if isinstance(value, np.ndarray):
                 frozen(value)
         vars(self).update(state)
+
+
+class Result(FrozenArrays):
+    """Mixin for results that files can contain; ``print`` shows their report."""
+
+    verified: bool
+
+    def __repr__(self) -> str:
+        """Return a title: the robot, the numbers of points and signals, and the accuracy."""
+        known = {key: getattr(self, key) for key in _TITLE if hasattr(self, key)}
+        parts = [f"'{known['robot']}'"]
+        if "__len__" in known:
+            parts.append(f"{known['__len__']()} points")
+        parts += [f"{size}={len(known[key])}" for key, size in _SIZES.items() if key in known]
+        parts += [f"{key}='{known[key]}'" for key in ("frame", "tool") if key in known]
+        if "dt" in known:
+            parts.append(f"dt={known['dt']:g} s" if known["dt"] else "continuous")
+        if "margin" in known:
+            parts.append(f"margin={np.min(known['margin']):.3g}")
+        if "residual" in known:
+            parts.append(f"residual={np.max(known['residual']):.1e}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def __str__(self) -> str:
+        report = self._report()
+        return report if self.verified else f"{report}\n{NOT_VERIFIED}"
+
+    def _report(self) -> str:
+        return repr(self)
+
+
+_SIZES = {
+    "t": "knots",
+    "parameters": "parameters",
+    "state_names": "nx",
+    "input_names": "nu",
+    "output_names": "ny",
+}
+_TITLE = ("robot", "__len__", *_SIZES, "frame", "tool", "dt", "margin", "residual")
 
 
 def frozen(array: Array) -> Array:

@@ -70,13 +70,6 @@ class GainBatch(Design):
     def __len__(self) -> int:
         return len(self.K)
 
-    def __repr__(self) -> str:
-        _, nu, nx = self.K.shape
-        return (
-            f"GainBatch('{self.robot}', {len(self)} points, nx={nx}, nu={nu}, "
-            f"margin={self.margin.min():.3g}, residual={self.residual.max():.1e})"
-        )
-
     @property
     def grid(self) -> dict[str, Array]:
         """Axes of the grid as {joint: values [rad|m]}; only joints that vary are included.

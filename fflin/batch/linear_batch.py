@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import numpy as np
 
 from fflin.base.errors import InputError, require_known
-from fflin.base.record import NOT_VERIFIED, reading
+from fflin.base.record import reading
 from fflin.base.validation import (
     Array,
-    FrozenArrays,
     Indices,
     Mask,
+    Result,
     frozen,
     number,
     refuse_masked,
@@ -44,7 +44,7 @@ _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearBatch(FrozenArrays):
+class LinearBatch(Result):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
@@ -131,16 +131,6 @@ class LinearBatch(FrozenArrays):
 
     def __len__(self) -> int:
         return len(self.q)
-
-    def __repr__(self) -> str:
-        _, nv, nu = self.B_lower.shape
-        return (
-            f"LinearBatch('{self.robot}', {len(self)} points, nx={2 * nv}, nu={nu}, "
-            f"frame='{self.frame}')"
-        )
-
-    def __str__(self) -> str:
-        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     @overload
     def __getitem__(self, index: int) -> LinearModel: ...

@@ -30,7 +30,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import bodies_named, varied, with_changed
+from fflin.robot.mass_properties import bodies_named, properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
@@ -289,7 +289,8 @@ class Dispersions:
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
             changed.setdefault(own, []).append(varied(pieces[at], *changes))
-        return {joint: with_changed(model.inertias[joint], x) for joint, x in changed.items()}
+        before = {joint: model.inertias[joint].toPseudoInertia().toMatrix() for joint in changed}
+        return {joint: properties(before[joint] + sum(x)) for joint, x in changed.items()}
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
         """Return the stiffness and the damping (N, n) of all joints, each if it is dispersed."""

@@ -245,7 +245,7 @@ class Funnel(Design):
         m, count = self.outcomes.shape
         return f"Funnel('{self.robot.name}', {m} knots of {count} runs, goal '{self.goal}')"
 
-    def __str__(self) -> str:
+    def _report(self) -> str:
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
         head += f", and with {self.within} at all times" * bool(self.within)

@@ -33,9 +33,8 @@ from fflin.control.channel import Saturation
 from fflin.dynamics.coordinates import states_of
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import LaneLoop, Runs, engine_of, noises, recorded
+from fflin.simulation.lanes import SLOTS, LaneLoop, Runs, engine_of, noises, packed, recorded
 from fflin.simulation.motion import Motion
-from fflin.simulation.packing import SLOTS, packed
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go, stop_conditions
 from fflin.simulation.simulate import motion_of

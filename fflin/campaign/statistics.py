@@ -16,11 +16,9 @@ from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
 from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
-from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES
-from fflin.simulation.lanes import Statistics
-from fflin.simulation.packing import no_law
+from fflin.kernel.tree import LANES, empty, laid_out, words_of
+from fflin.simulation.lanes import Statistics, no_law
 from fflin.simulation.plan import Plan
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
 from fflin.simulation.run import Recording, stop_of

@@ -11,7 +11,6 @@ import fflin
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.tables import counted, folded, signals
 from fflin.commands.points import (
-    attitude,
     linear_model,
     load_robot,
     once,
@@ -78,9 +77,7 @@ def equilibrium(arguments: Namespace) -> Report:
 
     refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
     robot = load_robot(arguments)
-    q, v, reference = point_of(robot, arguments)
-    if arguments.relative_equilibrium:
-        q, reference = attitude(robot, q, arguments.relative_equilibrium, arguments.frame)
+    q, v, reference = point_of(robot, arguments, robot.point)
     axes = {"frame": arguments.frame, "reference": reference}
     held = fflin.equilibrium(robot, q, v=v, **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)

@@ -122,25 +122,28 @@ def state_of(
 
 
 def point_of(
-    robot: fflin.Robot, arguments: Namespace
+    robot: fflin.Robot, arguments: Namespace, state: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q (nq,), v (nv,) and the reference of the operating point."""
-    refuse_pose(arguments)
-    return *state_of(robot, arguments, robot.point), reference_of(arguments)
+    """Return q (nq,), v (nv,) and the reference of an operating point; see `state_of`.
+
+    With --relative-equilibrium, they are at the pose of the relative equilibrium.
+    """
+    number = getattr(arguments, "relative_equilibrium", None)
+    if number:
+        names = (f"{prefix}rpy", f"{prefix}position")
+        refuse(arguments, names, "--relative-equilibrium already sets the base pose")
+    q, v = state_of(robot, arguments, state, prefix)
+    if not number:
+        return q, v, reference_of(arguments)
+    q, reference = attitude(robot, q, number, arguments.frame)
+    return q, v, reference
 
 
 def reference_of(arguments: Namespace) -> pin.SE3 | None:
     """Return the pose of --reference; None is the base pose at the operating point."""
     import pinocchio as pin
 
-    return pin.SE3.Identity() if arguments.reference == "world" else None
-
-
-def refuse_pose(arguments: Namespace, prefix: str = "") -> None:
-    """Raise an error if --relative-equilibrium is combined with --rpy or --position."""
-    if getattr(arguments, "relative_equilibrium", None):
-        names = (f"{prefix}rpy", f"{prefix}position")
-        refuse(arguments, names, "--relative-equilibrium already sets the base pose")
+    return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
 
 
 def linear_model(
@@ -148,30 +151,21 @@ def linear_model(
 ) -> tuple[fflin.Robot, fflin.LinearModel]:
     """Return the robot and its linear model about the operating point of the arguments."""
     robot = robot or load_robot(arguments)
-    return robot, model_about(robot, arguments, *point_of(robot, arguments))
+    return robot, model_about(robot, arguments, *point_of(robot, arguments, robot.point))
 
 
 def model_about(
-    robot: fflin.Robot,
-    arguments: Namespace,
-    q: Array,
-    v: Array | None,
-    reference: pin.SE3 | None = None,
+    robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
 ) -> fflin.LinearModel:
     """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium."""
-    number, axes = arguments.relative_equilibrium, arguments.frame
-    u: Array | None
-    if number:
-        q, reference = attitude(robot, q, number, axes)
-    if number or arguments.equilibrium:
-        which = "--relative-equilibrium" if number else "--equilibrium"
-        refuse(arguments, ("effort",), f"{which} already sets the inputs at the operating point")
-        held = fflin.equilibrium(robot, q, v=v, frame=axes, reference=reference)
-        q, u = held.q, held.u
-    else:
-        given = once("--effort", arguments.effort)
-        u = fflin.effort(robot, given) if given else None
-    return fflin.linearize(robot, q, v, u, frame=axes, reference=reference)
+    axes = {"frame": arguments.frame, "reference": reference}
+    if arguments.relative_equilibrium or arguments.equilibrium:
+        by = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"
+        refuse(arguments, ("effort",), f"{by} already sets the inputs at the operating point")
+        held = fflin.equilibrium(robot, q, v=v, **axes)
+        return fflin.linearize(robot, held.q, v, held.u, **axes)
+    given = once("--effort", arguments.effort)
+    return fflin.linearize(robot, q, v, fflin.effort(robot, given) if given else None, **axes)
 
 
 def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:

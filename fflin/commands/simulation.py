@@ -20,8 +20,8 @@ from fflin.commands.points import (
     model_about,
     models_along,
     once,
+    point_of,
     refuse,
-    refuse_pose,
     state_of,
 )
 from fflin.commands.regulator import (
@@ -57,7 +57,7 @@ def plan(arguments: Namespace) -> Report:
     q0, v0 = state_of(robot, arguments, combined(robot.point, robot.start))
     motion = fflin.plan(
         robot,
-        target_of(robot, arguments),
+        target_of(robot, arguments)[:2],
         arguments.duration,
         q0=q0,
         v0=v0,
@@ -276,29 +276,26 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
 
     If the operating point is at its own reference, the target pose of the base is the reference.
     """
-    from fflin.dynamics.coordinates import frame_of
-    from fflin.dynamics.state import Actuation
-    from fflin.linear.fit import require_same
+    import pinocchio as pin
 
-    made = f"{arguments.gain} was made for '{gain.robot}'"
-    frame = frame_of(robot, gain.frame)
-    state, reference = fflin.StateMap(robot, frame=frame), None
-    for kind, there in (("state", state), ("input", Actuation(state))):
-        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
-        require_same(made, robot, kind, own, (there.names, there.units))
-    q, v = state.to_pinocchio(gain.x0)
+    from fflin.control.gain import model_of
+
     if gain.x0[:6].any():
         refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
+        pose = gain.placement
     else:
-        q[:7] = target_of(robot, arguments)[0][:7]
+        pose = target_of(robot, arguments)[0][:7]
+    linear = partial(model_of, gain, robot, f"{arguments.gain} was made for '{gain.robot}'")
+    lin = linear(pin.XYZQUATToSE3(pose))
     if number := arguments.relative_equilibrium:
-        q, reference = attitude(robot, q, number, frame)
-    return fflin.linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
+        return linear(attitude(robot, lin.q, number, lin.frame)[1])
+    return lin
 
 
-def target_of(robot: fflin.Robot, arguments: Namespace) -> tuple[Array, Array | None]:
-    """Return the target q (nq,) and v (nv,), by default the operating point of the robot."""
+def target_of(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[Array, Array | None, pin.SE3 | None]:
+    """Return q (nq,), v (nv,) and the reference of the target, by default the operating point."""
     from fflin.dynamics.points import combined
 
-    refuse_pose(arguments, "target_")
-    return state_of(robot, arguments, combined(robot.point, robot.target), "target_")
+    return point_of(robot, arguments, combined(robot.point, robot.target), "target_")

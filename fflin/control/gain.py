@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -15,16 +14,21 @@ import numpy as np
 from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
-from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Values
 from fflin.control.optimal.riccati import Solution, rates_of
+from fflin.dynamics.coordinates import frame_of
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.fit import require_same
 from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     import control
+    import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
+    from fflin.robot.robot import Robot
 
 # A gain with more entries than this, as for a robot with more than three joints, is not shown.
 _LARGE = 9 * 18
@@ -40,24 +44,12 @@ _FRAGILE = 0.3
 class ModelDesign(Design):
     """Design for a linear model x' = A x + B u; the model is sampled if dt [s] is not 0."""
 
-    # Sizes in the one-line title, with the fields that they count.
-    SIZES: ClassVar[Mapping[str, str]] = {"nx": "state_names", "nu": "input_names"}
-
     A: Array
     B: Array
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     robot: str
-
-    def __repr__(self) -> str:
-        parts = [f"'{self.robot}'"]
-        parts += [f"{size}={len(getattr(self, of))}" for size, of in self.SIZES.items()]
-        parts.append(f"dt={self.dt:g} s" if self.dt else "continuous")
-        for key, form in (("margin", ".3g"), ("residual", ".1e")):
-            if hasattr(self, key):
-                parts.append(f"{key}={getattr(self, key):{form}}")
-        return f"{type(self).__name__}({', '.join(parts)})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,7 +128,7 @@ class Gain(ModelDesign):
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return the report: the gain, its poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
@@ -166,14 +158,15 @@ class Gain(ModelDesign):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        parts = [
-            f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
-            f"K ({nu} x {nx}){shown}",
-            _poles(self),
-            fold(figures),
-            *(fold(f"{what}: {said}") for what, said in more.items() if said),
-        ]
-        return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
+        return "\n\n".join(
+            (
+                f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
+                f"K ({nu} x {nx}){shown}",
+                _poles(self),
+                fold(figures),
+                *(fold(f"{what}: {said}") for what, said in more.items() if said),
+            )
+        )
 
     @property
     def closed_loop(self) -> Array:
@@ -229,6 +222,22 @@ class Gain(ModelDesign):
         most = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf
         phase = math.degrees(2.0 * math.atan(disk / 2.0))
         return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
+
+
+def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
+    """Return the model of a robot at the point stored with a gain, relative to a reference.
+
+    If the robot has other states or inputs than the gain, the error begins with the text `made`.
+    """
+    from fflin.linear.linearization import linearize
+
+    frame = frame_of(robot, gain.frame)
+    state = StateMap(robot, reference=reference, frame=frame)
+    for kind, there in (("state", state), ("input", Actuation(state))):
+        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
+        require_same(made, robot, kind, own, (there.names, there.units))
+    q, v = state.to_pinocchio(gain.x0)
+    return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
 
 def make_gain(

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
+from fflin.analysis.controllability import require_detectable, require_disturbed
 from fflin.analysis.reduction import outputs_of, regulated_part, selection
-from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
@@ -77,7 +77,6 @@ class Estimator(ModelDesign):
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
-    SIZES: ClassVar = {"nx": "state_names", "ny": "output_names"}
 
     L: Array
     L_update: Array
@@ -140,7 +139,6 @@ class Compensator(ModelDesign):
     """
 
     VECTORS: ClassVar = ("poles", "y0", "u0")
-    SIZES: ClassVar = {"nx": "state_names", "ny": "input_names", "nu": "output_names"}
 
     C: Array
     poles: Values

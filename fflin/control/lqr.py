@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fflin.analysis.controllability import require_stabilizable, require_weighed
 from fflin.analysis.reduction import regulated_part, selection
-from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.base.errors import (
     EquilibriumError,
     FflinWarning,

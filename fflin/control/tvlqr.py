@@ -14,7 +14,6 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.record import NOT_VERIFIED
 from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, number
 from fflin.control.default_weights import pace_along
@@ -103,7 +102,6 @@ class GainSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t", "knots")
-    SIZES: ClassVar = {"knots": "t", "nx": "state_names", "nu": "input_names"}
 
     K: Array
     Q: Array
@@ -117,11 +115,9 @@ class GainSchedule(Schedule):
     hold: str
     frame: str
 
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return the report: the sizes, the residual and the rule of the weights."""
-        verdict = [] if self.verified else [NOT_VERIFIED]
-        said = [repr(self), f"weights: {self.weights or 'as given'}", *verdict]
-        return "\n".join(folded([each]) for each in said)
+        return folded([repr(self), f"weights: {self.weights or 'as given'}"])
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that the gains were designed for."""
@@ -231,7 +227,6 @@ class FilterSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t",)
-    SIZES: ClassVar = {"knots": "t", "nx": "state_names", "ny": "output_names"}
 
     L: Array
     C: Array

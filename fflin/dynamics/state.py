@@ -413,7 +413,7 @@ class Actuation:
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:
                 columns.append(identity[6 + robot.joint_names.index(own[0])])
             else:
-                assert isinstance(item, kinds.WrenchInput)
+                assert isinstance(item, kinds.Thruster | kinds.ReactionWheel)
                 joint, placement = find_frame(robot.model, item.frame)
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))

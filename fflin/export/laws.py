@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,19 +14,16 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Compensation, Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
-from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.linear.fit import Signals, require_same, sensed
-from fflin.linear.linearization import linearize
+from fflin.linear.fit import Signals, sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits
-from fflin.robot.inputs import named_inputs
 from fflin.robot.loading import load
 from fflin.robot.robot import Robot
 
@@ -51,24 +48,22 @@ class Case(NamedTuple):
 class Law:
     """Control law as the tables of its C code, with test cases.
 
-    A state law is u = u0 - K (x - x0), with one row of tables, or a row for each sample. With
-    `axes`, K is interpolated between the points of a grid {joint: values}. An output law is
-    u = u0 + C z + D (y - y0), after which z becomes A z + B (y - y0).
+    A state law is u = u0 - K (x - x0), with one row of tables, or a row for each sample. With the
+    table `axis_points`, K is interpolated between the points of a grid of joint positions. An
+    output law is u = u0 + C z + D (y - y0), after which z becomes A z + B (y - y0).
     """
 
     title: str
     state: StateMap | None  # None for an output law
     signals: Signals  # names and units of the states or outputs
     inputs: Signals
-    frame: str
+    continuous: list[bool]  # whether each joint or output is the angle of a continuous joint
     dt: float
-    robot: Robot | None
+    robot: Robot
     lin: LinearModel | None
     tables: dict[str, Array]  # as in the C code, with u0, low and high for all laws
-    continuous: list[bool]  # whether each joint or output is the angle of a continuous joint
     operations: float  # bound on the number of rounded operations between an argument and a result
     cases: list[Case]
-    axes: dict[str, Array] = field(default_factory=dict)
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
@@ -96,63 +91,60 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     if robot is None:  # the law was read from a file, and the name may be a known robot
         with suppress(FflinError):
             robot = load(lin.robot if lin else getattr(given, "robot", ""))
-    if robot is not None:
-        robot = instance("robot", robot, Robot, "a Robot")
-    if isinstance(given, LinearController | Compensator):
-        return _output_law(given, lin, robot, limits)
     if robot is None:
         raise InputError(
             f"the robot of this {type(given).__name__} is not known, and the C code depends on "
             "its continuous joints; give the robot with robot= (--robot)"
         )
+    robot = instance("robot", robot, Robot, "a Robot")
+    if isinstance(given, LinearController | Compensator):
+        return _output_law(given, lin, robot, limits)
     return _state_law(given, lin, robot, limits)
 
 
-def _state_law(
-    given: OfStates,
-    lin: LinearModel | None,
-    robot: Robot,
-    limits: object,
-) -> Law:
+def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: object) -> Law:
+    axes: dict[str, Array] = {}
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
-    axes: dict[str, Array] = {}
-    policy: object = given
+    title = type(given).__name__
     if isinstance(given, TrajectoryFeedback):
         lin, dt, state = None, given.schedule.dt, given.state_map(robot)
-        reference, x0, u0, K = _samples(given, state)
+        tables = _samples(given, state)
     else:
         if isinstance(given, Gain):
-            lin = lin or _model_of(given, robot)
-            dt, gains = given.dt, given.K[None]
-            policy = StateFeedback(lin, given.K)
+            dt, given = given.dt, StateFeedback(lin or _model_of(given, robot), given.K)
         else:
-            lin = given.lin
-            dt = lin.dt
-            axes, gains = given.table() if isinstance(given, Gridded) else ({}, given.K[None])
+            dt = given.lin.dt
+        lin = given.lin
+        axes, gains = given.table() if isinstance(given, Gridded) else ({}, given.K[None])
         laws = [StateFeedback(lin, gain) for gain in gains]
         state = laws[0].state_map(robot)
-        terms = [law.terms(state) for law in laws]
-        reference, x0, u0 = lin.placement[None], terms[0][2][None], lin.u0[None]
-        K = np.array([gain for gain, _, _ in terms])
+        _, _, x0 = laws[0].terms(state)
+        tables = {"reference": lin.placement[None], "x0": x0[None], "u0": lin.u0[None]}
+        tables["K"] = np.array([law.terms(state)[0] for law in laws])
     actuation = Actuation(state)
-    low, high = _limits(robot, limits, actuation.names)
-    tables = {"reference": reference, "x0": x0, "u0": u0, "K": K, "low": low, "high": high}
+    tables |= _limits(robot, limits, actuation.names)
+    cases = list(_state_cases(state, bound(given, robot), dt, tables, axes))
+    tables["in_reference_axes"] = np.array(state.axes)
+    if axes:
+        sizes = [*map(len, axes.values())]
+        tables["axis_joint"] = np.array([*map(robot.joint_names.index, axes)])
+        tables["axis_size"] = np.array(sizes)
+        padded = [np.pad(x, (0, max(sizes) - len(x))) for x in axes.values()]
+        tables["axis_points"] = np.array(padded)
     cells = (np.abs(x).max() / np.diff(x).min() for x in axes.values())
     return Law(
-        title=type(given).__name__,
+        title=title,
         state=state,
         signals=(state.names, state.units),
         inputs=(actuation.names, actuation.units),
-        frame=state.frame,
+        continuous=[joint.unbounded for joint in robot.joints],
         dt=dt,
         robot=robot,
         lin=lin,
         tables=tables,
-        continuous=[joint.unbounded for joint in robot.joints],
         operations=state.nx + 32.0 + 8.0 * sum(cells),
-        cases=list(_state_cases(state, bound(policy, robot), dt, tables, axes)),
-        axes=axes,
+        cases=cases,
     )
 
 
@@ -208,29 +200,26 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
             "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
             "or design the gain again"
         )
-    frame = frame_of(robot, gain.frame)
-    state = StateMap(robot, frame=frame, reference=pin.XYZQUATToSE3(gain.placement))
-    own, there = (gain.state_names, gain.state_units), (state.names, state.units)
-    require_same(f"the gain was designed for '{gain.robot}'", robot, "state", own, there)
-    q, v = state.to_pinocchio(gain.x0)
-    return linearize(robot, q, v, gain.u0, frame=frame, reference=state.reference)
+    made = f"the gain was designed for '{gain.robot}'"
+    return model_of(gain, robot, made, pin.XYZQUATToSE3(gain.placement))
 
 
-def _limits(robot: Robot | None, limits: object, names: Sequence[str]) -> tuple[Array, Array]:
+def _limits(robot: Robot, limits: object, names: Sequence[str]) -> dict[str, Array]:
     """Return the least and largest inputs (nu,); without `limits`, they are infinite."""
-    if limits is None:
-        return np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    own = [x for _, group in named_inputs(robot.inputs if robot else ()) for x in group]
-    if robot is None or own != list(names):
-        raise InputError(
-            "limits need the robot with the inputs of the law; give the robot of the design "
-            "with robot= (--robot)"
-        )
-    return input_limits(robot, chosen_limits(robot, limits)[0])
+    high = np.full(len(names), np.inf)
+    low = -high
+    if limits is not None:
+        if Actuation(StateMap(robot)).names != tuple(names):
+            raise InputError(
+                "limits need the robot with the inputs of the law; give the robot of the design "
+                "with robot= (--robot)"
+            )
+        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
+    return {"low": low, "high": high}
 
 
-def _samples(policy: TrajectoryFeedback, state: StateMap) -> tuple[Array, Array, Array, Array]:
-    """Return poses, x0, u0 and K at each sample, and at last after the end of the trajectory."""
+def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
+    """Return the tables with one row for each sample; the last row acts after the trajectory."""
     if not (dt := policy.schedule.dt):
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
@@ -239,37 +228,30 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> tuple[Array, Array,
     last = int(np.ceil(policy.over / dt * (1.0 - 1e-12)))
     while last * dt <= policy.over:
         last += 1
-    world, rows = StateMap(state.robot, frame="local"), []
-    for t in dt * np.arange(last + 1):
-        q, v, u = policy.commanded(t)
-        attitude = quaternion_product(world.origin_quaternion, q[3:7])
-        x0 = np.zeros(state.nx)
-        x0[state.groups.q_m] = world.joint_positions(q)
-        x0[6 + state.robot.n :] = world.velocities(v)
-        rows.append((np.append(world.positions(q), attitude), x0, u, policy.gain(t)))
-    poses, states, inputs, gains = map(np.array, zip(*rows, strict=True))
-    return poses, states, inputs, gains
+    times = dt * np.arange(last + 1)
+    q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
+    attitudes = [quaternion_product(state.origin_quaternion, each) for each in q[:, 3:7]]
+    pose = np.zeros((len(q), 6))
+    return {
+        "reference": np.hstack((state.positions(q), attitudes)),
+        "x0": np.hstack((pose, state.joint_positions(q), state.velocities(v))),
+        "u0": u0,
+        "K": np.array([*map(policy.gain, times)]),
+    }
 
 
 def _output_law(
-    given: LinearController | Compensator,
-    lin: LinearModel | None,
-    robot: Robot | None,
-    limits: object,
+    given: LinearController | Compensator, lin: LinearModel | None, robot: Robot, limits: object
 ) -> Law:
     if isinstance(given, LinearController):
         terms, lin = given.terms, given.lin
         inputs = lin.input_names, lin.input_units
         signals = lin.output_names, lin.output_units
     else:
-        none = np.zeros((len(given.u0), len(given.y0)))
+        none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
-        known: dict[str, str] = {}  # {signal: unit}
-        if robot is not None:
-            state = StateMap(robot)
-            actuation = Actuation(state)
-            for names, units in (sensed(state), (actuation.names, actuation.units)):
-                known |= dict(zip(names, units, strict=True))
+        actuation, (names, units) = Actuation(state), sensed(state)
+        known = dict(zip(names + actuation.names, units + actuation.units, strict=True))
         inputs, signals = (
             (names, tuple(known.get(name, "unknown") for name in names))
             for names in (given.output_names, given.input_names)
@@ -279,24 +261,19 @@ def _output_law(
             "the controller is continuous, expected a sampled controller; use "
             "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
-    low, high = _limits(robot, limits, inputs[0])
-    joints = robot.joints if robot else ()
-    angles = {f"q_m.{joint.name}" for joint in joints if joint.unbounded}
+    angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
     continuous = [name in angles for name in signals[0]]
+    tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")}
     return Law(
         title=type(given).__name__,
         state=None,
         signals=signals,
         inputs=inputs,
-        frame=lin.frame if lin else "",
+        continuous=continuous,
         dt=given.dt,
         robot=robot,
         lin=lin,
-        tables={
-            **{key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")},
-            **{"u0": terms.u0[None], "low": low, "high": high},
-        },
-        continuous=continuous,
+        tables={**tables, "u0": terms.u0[None], **_limits(robot, limits, inputs[0])},
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
     )

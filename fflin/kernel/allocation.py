@@ -9,18 +9,16 @@ References
 C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, SIAM, 1995, chapter 23.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np
 
 from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import INDICES, LANED, Struct, empty
-from fflin.kernel.bodies import factorise, write_columns
+from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
-from fflin.kernel.lanes import called, inlined, load, root, store
+from fflin.kernel.lanes import called, load, root, store
+from fflin.kernel.tree import INDICES, LANED, Struct, empty
 
 # Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
 # smallest.
@@ -75,21 +73,6 @@ def least_squares(least, most, size):
     )
 
 
-@inlined
-def half_solve(work, tree, x, first):
-    """Replace the force f at x by D^-1/2 L^-T f.
-
-    The squared norm of the result is f^T M^-1 f = a^T M a with the acceleration a = M^-1 f.
-    """
-    for k in range(len(tree.row) - 1, -1, -1):
-        value, row = load(x, first + k), tree.row[k]
-        for t in range(tree.depth[k]):
-            at = first + tree.path[row + t]
-            store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
-        store(x, first + k, value * root(load(work, tree.scaled + row + tree.depth[k])))
-
-
-@inlined
 def allocate(allocation, point, commanded):
     """Write a command into the inputs, after allocation if there is an allocation problem."""
     if len(allocation.problem.least) == 0:
@@ -129,8 +112,13 @@ def _realise(allocation, point, commanded):
         first = tree.input[index] * size
         for row in range(size):
             store(columns, first + row, load(work, tree.columns + row * carried + index))
+    # Replace each force f by D^-1/2 L^-T f, whose squared norm is f^T M^-1 f.
+    tree = asking.tree
     for column in range(count + 1):
-        half_solve(work, asking.tree, columns, column * size)
+        solve_inwards(work, tree, columns, column * size)
+        for k in range(size):
+            pivot, at = load(work, tree.scaled + tree.row[k] + tree.depth[k]), column * size + k
+            store(columns, at, load(columns, at) * root(pivot))
     for lane in range(lanes.width(point.u)):
         solve(problem, size, lane)
         for index in range(count):

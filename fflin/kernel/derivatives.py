@@ -22,8 +22,6 @@ S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of r
 using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np
@@ -36,11 +34,10 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
-from fflin.kernel.lanes import compiled, inlined, load, splat, store
+from fflin.kernel.lanes import compiled, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
 
 
-@inlined
 def _coriolis(work, at, w):
     """Return the moment and force 2 B w of a joint's subtree."""
     G = vec.get_columns(work, at + MOMENTS)
@@ -51,28 +48,16 @@ def _coriolis(work, at, w):
     return moment, vec.plus(force, force)
 
 
-@inlined
 def _coriolis_transposed(work, at, along):
     """Return the moment of 2 B^T s for a motion vector s; the force of 2 B^T s is zero."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
-    moment = vec.plus(
-        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
-    )
+    moment = vec.minus(vec.times(w, trace), vec.across(G, w))
+    moment = vec.plus(moment, vec.cross(vec.get3(work, at + MOMENTUM), along[1]))
     return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
-@inlined
-def _add_column(work, at, width, force):
-    """Add a moment and a force to the first six rows of a column, the rows of the base."""
-    for index in range(3):
-        vec.add(work, at + index * width, force[0][index])
-        vec.add(work, at + (3 + index) * width, force[1][index])
-
-
-@inlined
 def differentiate(work, tree):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
@@ -119,21 +104,17 @@ def differentiate(work, tree):
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
-        _add_column(work, tree.lower + column, width, by_q)
-        _add_column(work, tree.lower + (column + 6 + n), width, by_v)
+        bodies.add_column(work, tree.lower + column, width, by_q)
+        bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
     # The base's force over omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
         weight = inertia_times(work, tree.inertias, turning)
-        moment, force = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
-        for part in range(3):
-            row = tree.lower + (part * width + 6 + n + index)
-            store(work, row, moment[part])
-            store(work, row + 3 * width, force[part])
+        total = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
+        bodies.add_column(work, tree.lower + (6 + n + index), width, total)
 
 
-@inlined
 def _push(work, tree, by_u):
     """Write the derivatives over the inputs: columns of M^-1, or linear combinations of them."""
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
@@ -150,7 +131,6 @@ def _push(work, tree, by_u):
             store(work, by_u + row * count + tree.input[index], total)
 
 
-@inlined
 def _solve(work, tree, slopes):
     """Write -M^-1 times the derivatives of the forces, six columns at a time."""
     size = len(tree.row)
@@ -171,7 +151,6 @@ def _solve(work, tree, slopes):
             vec.put6(work, slopes + column + row * width, total)
 
 
-@inlined
 def _pack(rows, first, lanes):
     """Copy the rows of eight points into an array (entries, lanes)."""
     for entry in range(len(lanes)):
@@ -179,7 +158,6 @@ def _pack(rows, first, lanes):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
-@inlined
 def _unpack(work, start, entries, out, first, offset):
     """Copy entries of a laned array to the rows of eight points, from column `offset` on."""
     for entry in range(entries):
@@ -209,7 +187,6 @@ def derive(tree, points, out, lanes, work):
             bodies.move_bodies(work, tree, lanes.nu)
             bodies.load_bodies(work, tree)
             bodies.load_carried(work, tree, lanes.u)
-            bodies.load_momenta(work, tree)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
         for k in range(size):  # `factorise` overwrites the diagonal of the packed M

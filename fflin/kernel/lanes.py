@@ -6,8 +6,6 @@ it. `kernel.machine_code` compiles the same function, also for arrays with a sec
 lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import TypeAlias, TypeVar
@@ -23,7 +21,7 @@ Number: TypeAlias = float
 # Numbers in memory. The entries of a list are read faster than the entries of an array.
 Entries: TypeAlias = Array | list[Number]
 
-# {function of the kernel: name of the decorator that says how it is compiled}.
+# {function of the kernel: how it is compiled}. All other functions are inlined in their callers.
 HOW: dict[Callable[..., object], str] = {}
 # {function that uses NumPy: loop that is compiled in its place}.
 LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
@@ -37,7 +35,6 @@ def _decorator(how: str) -> Callable[[F], F]:
     return noted
 
 
-inlined = _decorator("inlined")
 # For functions that are rarely called: inlining saves little there, and takes long to compile.
 called = _decorator("called")
 # For functions called from Python; their machine code is stored on disk.
@@ -71,14 +68,12 @@ def below(value: Number, bound: Number) -> bool:
     return value < bound
 
 
-@inlined
 def peek(array: Array, index: int, lane: int) -> float:
     """Return the value of a lane at an index."""
     value: float = array[index] if array.ndim == 1 else array[index, lane]
     return value
 
 
-@inlined
 def poke(array: Array, index: int, lane: int, value: float) -> None:
     """Write the value of a lane at an index."""
     if array.ndim == 1:
@@ -87,7 +82,6 @@ def poke(array: Array, index: int, lane: int, value: float) -> None:
         array[index, lane] = value
 
 
-@inlined
 def width(array: Array) -> int:
     """Return the number of lanes of an array, 0 if the array is empty."""
     return array.size // max(len(array), 1)

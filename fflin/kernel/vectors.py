@@ -5,24 +5,20 @@ displacement has the order of the state: the base's rotation and translation in 
 joints.
 """
 
-from __future__ import annotations
-
 from math import factorial
 
 import numpy as np
 
-from fflin.kernel.lanes import floor, inlined, load, store
+from fflin.kernel.lanes import floor, load, store
 
 _TERMS = 10  # exact to machine precision up to half a turn; a step rotates by less than a radian
 
 
-@inlined
 def get3(work, at):
     """Read a vector."""
     return load(work, at), load(work, at + 1), load(work, at + 2)
 
 
-@inlined
 def put3(work, at, a):
     """Write a vector."""
     store(work, at, a[0])
@@ -30,20 +26,17 @@ def put3(work, at, a):
     store(work, at + 2, a[2])
 
 
-@inlined
 def copy(source, first, target, to, count):
     """Copy entries."""
     for index in range(count):
         store(target, to + index, load(source, first + index))
 
 
-@inlined
 def add(work, at, value):
     """Add to an entry."""
     store(work, at, load(work, at) + value)
 
 
-@inlined
 def add3(work, at, a):
     """Add to a vector."""
     add(work, at, a[0])
@@ -51,99 +44,83 @@ def add3(work, at, a):
     add(work, at + 2, a[2])
 
 
-@inlined
 def get6(work, at):
     """Read a spatial vector."""
     return get3(work, at), get3(work, at + 3)
 
 
-@inlined
 def put6(work, at, s):
     """Write a spatial vector."""
     put3(work, at, s[0])
     put3(work, at + 3, s[1])
 
 
-@inlined
 def add6(work, at, s):
     """Add to a spatial vector."""
     add3(work, at, s[0])
     add3(work, at + 3, s[1])
 
 
-@inlined
 def get_columns(work, at):
     """Read a matrix of three columns."""
     return get3(work, at), get3(work, at + 3), get3(work, at + 6)
 
 
-@inlined
 def cross(a, b):
     """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inlined
 def dot(a, b):
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
 def plus(a, b):
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@inlined
 def minus(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inlined
 def times(a, value):
     """Return a vector times a number."""
     return a[0] * value, a[1] * value, a[2] * value
 
 
-@inlined
 def product(columns, a):
     """Return a matrix, given by its columns, times a vector."""
     return plus(plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2]))
 
 
-@inlined
 def across(columns, a):
     """Return the transpose of a matrix, given by its columns, times a vector."""
     return dot(columns[0], a), dot(columns[1], a), dot(columns[2], a)
 
 
-@inlined
 def dot6(s, t):
     """Return the scalar product of a motion vector and a force vector, in either order."""
     return dot(s[0], t[0]) + dot(s[1], t[1])
 
 
-@inlined
 def plus6(s, t):
     """Return s + t of spatial vectors."""
     return plus(s[0], t[0]), plus(s[1], t[1])
 
 
-@inlined
 def minus6(s, t):
     """Return s - t of spatial vectors."""
     return minus(s[0], t[0]), minus(s[1], t[1])
 
 
-@inlined
 def times6(s, value):
     """Return a spatial vector times a number."""
     return times(s[0], value), times(s[1], value)
 
 
-@inlined
 def cosine_and_sine(x):
     """Return the cosine and sine of |x| < 1e6, accurate to one unit in the last place.
 
@@ -180,7 +157,6 @@ def _series(first):
     shares = [(-1) ** k * factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
     last, rest = shares[-1], tuple(shares[-2::-1])
 
-    @inlined
     def series(x):
         total = rest[0] + x * last
         for share in rest[1:]:
@@ -193,7 +169,6 @@ def _series(first):
 _cosine, _sine, _sixth = _series(0), _series(1), _series(3)
 
 
-@inlined
 def quaternion_times(a, b):
     """Return the product of quaternions, each given as ((x, y, z), w)."""
     v, w = a
@@ -202,7 +177,6 @@ def quaternion_times(a, b):
     return vector, w * scalar - dot(v, other)
 
 
-@inlined
 def columns_of(quaternion):
     """Return the columns of a unit quaternion's rotation matrix."""
     (x, y, z), w = quaternion
@@ -216,19 +190,16 @@ def columns_of(quaternion):
     )
 
 
-@inlined
-def attitude(q):
-    """Return the base's quaternion at a configuration."""
-    return get3(q, 3), load(q, 6)
+def attitude(q, at=0):
+    """Return the base's quaternion at a configuration, which begins at an index."""
+    return get3(q, at + 3), load(q, at + 6)
 
 
-@inlined
 def axes_of(q):
     """Return the base's axes in the world."""
     return columns_of(attitude(q))
 
 
-@inlined
 def displace(tree, q, along, out):
     """Write q displaced along a tangent vector; the base moves by the exponential map."""
     w, v = get3(along, 0), get3(along, 3)

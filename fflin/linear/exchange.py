@@ -71,9 +71,6 @@ class ToolModel(StateSpace, Design):
     v: Array
     reference: str
 
-    def __repr__(self) -> str:
-        return f"ToolModel('{self.robot}', '{self.tool}', nx={len(self.A)}, dt={self.dt:g})"
-
 
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
@@ -275,11 +272,11 @@ def from_tool(
             change = np.vstack((0.0 * change[:nv], change[nv:] / step))
         changes.append(change)
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
-    A, B = (
-        np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
-        for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True)
-    )
-    return replace(lin, A=A, B=B)
+    found = []
+    for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True):
+        noise = (old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max())
+        found.append(np.where(noise, 0.0, old + new))
+    return replace(lin, A=found[0], B=found[1])
 
 
 def _jacobians_at(

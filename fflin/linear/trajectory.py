@@ -131,11 +131,8 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        q, v, u = (
-            _configurations(robot, self.q, count),
-            as_double("v", self.v),
-            as_double("u", self.u),
-        )
+        q = _configurations(robot, self.q, count)
+        v, u = as_double("v", self.v), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
         u = np.vstack((u, u[-1:])) if short else u
@@ -147,10 +144,8 @@ class Trajectory(Design):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
-        values["hold"] = self.hold or ("previous" if short else "linear")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        hold = self.hold or ("previous" if short else "linear")
+        vars(self).update(t=times, q=frozen(q), v=frozen(v), u=frozen(u), hold=hold)
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -159,11 +154,10 @@ class Trajectory(Design):
             f"{self.t[-1]:g} s, hold='{self.hold}', frame='{self.frame}')"
         )
 
-    def __str__(self) -> str:
+    def _report(self) -> str:
         """Return a text about the trajectory, with its residual as a motion of the robot."""
         said = self._fault or f"residual {self.residual.max():.1e}"
-        note = f"\n{folded(self._note.splitlines())}" if self._note else ""
-        return f"{folded(super().__str__().splitlines())}\n{folded([said])}{note}"
+        return folded([repr(self), said, *self._note.splitlines()])
 
     @cached_property
     def _aba(self) -> Aba:
@@ -232,16 +226,7 @@ class Trajectory(Design):
             times = np.append(times, self.t[-1])
         q, v, _ = self.points(times)
         k, s = intervals_of(self.t, times)
-        return Trajectory(
-            self.robot,
-            times,
-            q,
-            v,
-            self._input(k, s[:, None]),
-            hold=self.hold,
-            frame=self.frame,
-            verified=self.verified,
-        )
+        return Trajectory._of(self, t=times, q=q, v=v, u=self._input(k, s[:, None]), _note="")
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""

@@ -1,47 +1,86 @@
-"""Choice of the engine; the compiled loop, which simulates eight runs of a plan at once.
+"""The compiled engine: its choice, the arrays of a plan, and the loop over eight runs at once.
 
 Each run has a lane. If there is only one run, all lanes compute it.
 """
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.process import LONG_RUN, Progress
+from fflin.base.process import Progress
+from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, vector
+from fflin.control.channel import channel_of
 from fflin.control.linear_controller import LinearController, OutputFeedback
-from fflin.control.policies import Allocation, Gridded, StateFeedback, decider, measured_at
-from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
-from fflin.kernel import loop
-from fflin.kernel.arguments import laid_out, words_of
+from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, decider, measured_at
+from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
+from fflin.dynamics.state import StateMap
+from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree, work_space
-from fflin.robot.joints import ROOT
-from fflin.simulation.packing import SLOTS, packed
+from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, words_of, work_space
+from fflin.robot.fields import input_limits, limits_of
+from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan, Times
-from fflin.simulation.run import STOPS, Recording, ending_of, go, stop_conditions, stop_of
+from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # Number of steps above which a single run uses the compiled loop, if its machine code is stored.
 LONG = 20_000
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
-# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
-# once.
-_FRACTION, _COMPILING = 0.1, 30.0
 
-_log = logging.getLogger("fflin")
-
+SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
 # {name of an array of the loop: values of N runs (N, size)}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
+
+
+def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
+    """Return the requested engine for a plan, or choose an engine.
+
+    Many runs use the compiled loop if it supports the plan. A single run uses it only if the run is
+    long and the machine code is stored already.
+    """
+    if checked_engine(engine) == "python":
+        return "python"
+    reason = not_compilable(plan)
+    if engine == "compiled" and reason:
+        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
+    wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
+    return "compiled" if wanted and not reason else "python"
+
+
+def not_compilable(plan: Plan) -> str:
+    """Return why the compiled loop cannot run a plan, or an empty text if it can."""
+    plant, policy, times = plan.plant, decider(plan.policy), plan.times
+    designs = [plan.policy.design] if isinstance(plan.policy, Allocation) else []
+    reason = ""
+    if not numba_is_there():
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+    elif plan.events or plan.options.callback or plant.disturbance or plant.field:
+        reason = "events, callbacks, disturbances and the field of an orbit are computed in Python"
+    elif not (policy is None or type(policy) in _KNOWN or isinstance(policy, Gridded)):
+        reason = f"a {type(policy).__name__} is computed in Python"
+    for robot in () if reason else (plant.robot, *designs):
+        at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
+        if batch_tree(robot) is None or not at_home:
+            return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
+    if not reason and isinstance(policy, _OF_OUTPUTS):
+        dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
+        if dt and abs(times.sample * times.dt - dt) > 1e-6 * dt:
+            return "its sample time differs from the compensator's"
+        if policy.noise is not None and not times.sample:
+            return "noise is evaluated at every stage of every step"
+        try:
+            measured_at(plant.state)
+        except InputError as error:
+            return str(error)
+    return reason
 
 
 def noise_generator(seed: float) -> np.random.Generator:
@@ -247,63 +286,207 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
 
 
-def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
-    """Return the requested engine for a plan, or choose an engine.
+def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
+    """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
-    Many runs use the compiled loop if it supports the plan. A single run uses it only if the run is
-    long and the machine code is stored already.
+    `stop` has rates in the order of v. The law has room for noise if it is `noisy`.
     """
-    if checked_engine(engine) == "python":
-        return "python"
-    reason = _reason(plan)
-    if engine == "compiled" and reason:
-        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
-    wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
-    return "compiled" if wanted and not reason else "python"
+    plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
+    h, state = times.dt, plant.state
+    size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
+    mechanics = mechanics_of(plant)
+    # Commands that would act only after the end of the run need no space in the delay line.
+    channel = channel_of(plan.limits, u, times.sample, min(times.delay, times.steps))
+    return loop.Arguments(
+        robot=mechanics,
+        method=loop.Method(
+            h=h,
+            origin=method.origins,
+            shift=shift.ravel(),
+            speed=speed.ravel(),
+            nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
+            weights=np.array(method.weights) * h,
+            moments=h * (np.array(method.moments) * h),
+        ),
+        law=_law(plan, mechanics, noisy),
+        channel=channel._replace(delay=[float(times.delay)]),
+        # The loop writes these at its start.
+        reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
+        project=plan.project,
+        pushed=not plant.isolated(driven=plan.law is not None),
+        stop=stop._replace(squares=state.velocities(stop.squares)),
+        point=forward.Point(
+            q=plan.q, nu=state.velocities(plan.v), u=u, pushing=u, wrench=np.zeros(6)
+        ),
+        stages=loop.Stages(
+            rates=np.zeros(speed.shape[1] * size),
+            along=np.zeros(size),
+            first=plan.q,
+            second=plan.q,
+            u=u,
+        ),
+    )
 
 
-def _reason(plan: Plan) -> str:
-    """Return why the compiled loop cannot run a plan, or an empty text if it can."""
-    plant, policy, robots = plan.plant, decider(plan.policy), [plan.plant.robot]
-    if not numba_is_there():
-        return "numba is not installed (pip install 'fflin[fast]')"
-    if plan.events or plan.options.callback or plant.disturbance or plant.field:
-        return "events, callbacks, disturbances and the field of an orbit are computed in Python"
+def mechanics_of(plant: Plant) -> forward.Mechanics:
+    """Return the kernel's parameters of a robot."""
+    robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
+    springs = robot.springs
+    assert tree is not None
+    return forward.Mechanics(
+        tree=tree,
+        gravity=list(robot.gravity),
+        index=[joint.idx_q for joint in robot.joints],
+        circling=[joint.unbounded for joint in robot.joints],
+        scale=[joint.scale for joint in robot.joints],
+        springy=(springs.stiffness != 0.0) | (springs.damping != 0.0),
+        rest=springs.rest,
+        held=[held.start for held in actuation.held],
+        triads=plant.triads,
+        origin=pin.SE3ToXYZQUAT(plant.state.origin),
+        faults=plant.faults,
+    )
+
+
+def no_law(state: StateMap, u: Array) -> policies.Law:
+    """Return a law that gives no commands; it only computes states and errors."""
+    law = empty(policies.LAW)
+    q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
+    point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
+    return law._replace(
+        kind=policies.NOTHING,
+        turned=list(state.axes),
+        origin=pin.SE3ToXYZQUAT(state.origin),
+        near=np.zeros(state.robot.n),
+        x=np.zeros(state.nx),
+        u=u,
+        path=law.path._replace(along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point),
+    )
+
+
+def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
+    """Return the law of a plan's policy; with an allocation, of the robot `asking`."""
+    asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
-        robots.append(plan.policy.design)
-    known = type(policy) in _KNOWN or isinstance(policy, Gridded)
-    if policy is not None and not known:
-        return f"a {type(policy).__name__} is computed in Python"
-    for robot in robots:
-        at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
-        if batch_tree(robot) is None or not at_home:
-            return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
-    return _unmeasured(plan, policy) if isinstance(policy, _OF_OUTPUTS) else ""
+        asking = Plant(StateMap(plan.policy.design, reference=state.reference, frame=state.frame))
+    law = no_law(state, np.zeros(len(asking.actuation.names)))
+    if isinstance(plan.policy, Allocation):
+        law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))
+    if isinstance(policy, LinearController | TrajectoryOutputFeedback):
+        law = _filtered(law, plan, policy, asking, mechanics)
+    elif isinstance(policy, TrajectoryFeedback):
+        law = law._replace(kind=policies.TRACK, path=_path(law.path, plan, policy, asking.state))
+    elif isinstance(policy, StateFeedback | Gridded):
+        law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx))
+        x0 = policy.lin.x0
+        direct, grid = law.filter, law.grid
+        if isinstance(policy, StateFeedback):
+            K, offset, x0 = policy.terms(state)
+            direct = direct._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
+        else:
+            grid = _grid(policy, state.robot.joint_names)
+        law = law._replace(filter=direct, grid=grid, near=x0[state.groups.q_m].copy())
+    size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
+    return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def _unmeasured(plan: Plan, policy: LinearController | TrajectoryOutputFeedback) -> str:
-    """Return why the compiled loop cannot evaluate a plan's compensator, or an empty text."""
-    dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
-    if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
-        return "its sample time differs from the compensator's"
-    if policy.noise is not None and not plan.times.sample:
-        return "noise is evaluated at every stage of every step"
-    try:
-        measured_at(plan.plant.state)
-    except InputError as error:
-        return str(error)
-    return ""
+def _grid(policy: Gridded, joints: tuple[str, ...]) -> policies.Grid:
+    axes, gains = policy.table()
+    sizes = [len(values) for values in axes.values()]
+    return policies.Grid(
+        joint=[joints.index(name) for name in axes],
+        first=np.cumsum([0, *sizes]),
+        values=np.concatenate(list(axes.values())),
+        stride=[np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))],
+        K=gains.ravel(),
+        offset=(policy.lin.u0 + gains @ policy.lin.x0).ravel(),
+        at=np.zeros(len(sizes)),
+    )
 
 
-def carried_out(plan: Plan, engine: str) -> Recording:
-    """Simulate a plan with an engine."""
-    if engine == "compiled":
-        return recorded(plan)
-    began, slower = time.perf_counter(), not _reason(plan)
-    run = go(plan, "(faster: --engine compiled) " if slower else "")
-    spent = time.perf_counter() - began
-    if spent > LONG_RUN and slower:
-        once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-        said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled) would"
-        _log.warning(f"fflin: {said} take about %.0f s%s", spent, _FRACTION * spent, once)
-    return run
+def _filtered(
+    law: policies.Law,
+    plan: Plan,
+    policy: LinearController | TrajectoryOutputFeedback,
+    asking: Plant,
+    mechanics: forward.Mechanics,
+) -> policies.Law:
+    """Return the law of a compensator, with one row of its matrices for each sample."""
+    state, times, rows = asking.state, plan.times, 1
+    loop = policy.bind(asking.robot)
+    if isinstance(policy, TrajectoryOutputFeedback):
+        rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
+    samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
+    _, charts, near = zip(*samples, strict=True)
+    nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
+    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by, *_ in samples]
+    compensator = {
+        key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
+    }
+    measured, gyros = measured_at(state)
+    frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
+    axes = mechanics.tree.axes
+    turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
+    return law._replace(
+        kind=policies.LINEAR,
+        origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for chart in charts]),
+        near=np.concatenate([x[state.groups.q_m] for x in near]),
+        filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
+        measured=measured,
+        gyros=[frame.joint - ROOT for frame in frames],
+        gyro_axes=np.array([turn.ravel("F") for turn in turns]).ravel(),
+        x=np.zeros(state.nx + 3 * len(gyros)),
+    )
+
+
+def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
+    """Return the allocation of commands for the robot `asking` to inputs of the robot `giving`."""
+    asks, size = mechanics_of(asking), plant.state.nx // 2
+    least, most = input_limits(plant.robot, limits_of(plant.robot))
+    point = empty(forward.POINT)._replace(
+        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
+    )
+    return allocation.Allocation(
+        asking=asks,
+        giving=giving,
+        point=point,
+        work=np.zeros(max(asks.tree.size, giving.tree.size)),
+        problem=allocation.least_squares(least, most, size),
+    )
+
+
+def _path(
+    path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
+) -> policies.Path:
+    """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
+    motion, schedule = policy.trajectory, policy.schedule
+    shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
+    q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
+    ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
+    pieces = schedule.K if schedule.dt else schedule.pieces
+    pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
+    if ends:
+        last = np.zeros_like(pieces[:1])
+        last[0, 0] = policy.end_gain.ravel()
+        pieces = np.concatenate((pieces, last))
+        q.append(policy.end.q)
+        u.append(policy.end.u0.copy())
+        speed = np.append(speed, state.velocities(policy.end.v))
+        for at in held:
+            u[-1][at : at + 3] = rotation_matrix(q[-1][3:7]) @ u[-1][at : at + 3]
+    return path._replace(
+        t=motion.t,
+        q=np.concatenate(q),
+        u=np.concatenate(u),
+        shift=shift,
+        speed=speed,
+        hold=motion.hold == "previous",
+        ahead=policy.ahead,
+        ends=bool(ends),
+        held=held,
+        over=policy.over,
+        last=float(schedule.t[-1] - schedule.t[0]),
+        starts=schedule.starts,
+        K=pieces.ravel(),
+        order=pieces.shape[1],
+    )

@@ -8,9 +8,9 @@ import json
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from time import monotonic, sleep
-from typing import TypeAlias, TypedDict
+from typing import TypeAlias
 
 import numpy as np
 from tornado.httpserver import HTTPServer
@@ -56,38 +56,78 @@ class Live:
         robot: Robot,
         q: Array,
         *,
-        scene: str = "space",
-        tool: str | None = None,
-        follow: bool | None = None,
-        speed: float = 1.0,
-        port: int = 0,
-        frame: str | None = None,
+        scene: str,
+        tool: str | None,
+        follow: bool | None,
+        speed: float,
+        port: int,
+        frame: str | None,
     ) -> None:
-        self.robot = robot
-        self._data = robot.model.createData()
-        self._state_map = StateMap(robot)
-        self._joints = _joints(robot)
-        self._lock = threading.Lock()
-        self._speed = speed
+        self.robot, self._speed = robot, speed
+        self._data, self._state_map = robot.model.createData(), StateMap(robot)
+        self._ranges, self._lock = _ranges(robot), threading.Lock()
         # Clock time and simulation time [s] at the beginning of the shown simulation.
         self._began: tuple[float, float] | None = None
-        page = Page(robot, scene, tool, frame, self._forward)
+        self._running, self._state, self._clients = False, "{}", set[_Socket]()
+        self._page = page = Page(robot, scene, tool, frame, self._send)
         self.meshcat, self.notes = page.meshcat, page.drawing.notes
         poses = body_poses(robot, self._data, q)
         page.set_stage(poses, subtitle(robot))
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
-        html = page.html(
+        sliders = [
+            {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
+            for name, (low, high) in self._ranges.items()
+        ]
+        self._html = page.html(
             "live",
             page.drawing.points(poses),
             follow=bool(follow),
-            joints=self._joints,
+            joints=sliders,
             names=[*axes, *robot.joint_names],
             bodies=page.nodes,
         )
-        self._server = Server(html, page.window.commands, self._asked, port)
-        self.url = page.window.web_url = self._server.url
-        self.port = self._server.port
+        try:
+            listener = socket.create_server((_HOST, port), backlog=128)
+        except OSError as error:
+            why = os.strerror(error.errno or 0)
+            raise InputError(
+                f"port {port} is not available: {why}; give another port, or 0 for a free port"
+            ) from None
+        listener.setblocking(False)
+        self.port: int = listener.getsockname()[1]
+        self.url = page.window.web_url = f"http://{_HOST}:{self.port}/"
+        self._hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
+        self._thread = self._serve(listener)
         self.show(q)
+
+    def _serve(self, listener: socket.socket) -> threading.Thread:
+        """Start the thread that serves the page until the viewer is closed."""
+        given = {"live": self}
+        application = Application(
+            [("/", _Page, given), ("/socket", _Socket, given)],
+            log_function=lambda _: None,
+            websocket_ping_interval=20,
+        )
+        started = threading.Event()
+
+        async def run() -> None:
+            self._loop = asyncio.get_running_loop()
+            self._stop = asyncio.Event()
+            server = HTTPServer(application)
+            server.add_socket(listener)
+            self._running = True
+            started.set()
+            await self._stop.wait()
+            self._running = False
+            server.stop()
+            for client in list(self._clients):
+                client.close()
+            await server.close_all_connections()
+
+        thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+        thread.start()
+        started.wait()
+        return thread
 
     def show(self, q: Array, t: float | None = None) -> None:
         """Show the robot at a valid configuration (nq,), and the time t [s]."""
@@ -100,11 +140,12 @@ class Live:
             state = {
                 "time": None if t is None else float(t),
                 "poses": poses.round(7).tolist(),
-                "joints": [self.robot.joint(each["name"]).value(q) for each in self._joints],
+                "joints": [self.robot.joint(name).value(q) for name in self._ranges],
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
-            self.q = q
-        self._server.update(json.dumps(state))
+            self.q, self._state = q, json.dumps(state)
+        # Slow browsers skip states that are out of date.
+        self._each(_Socket.update)
 
     def __call__(self, t: float, q: Array, *_: object) -> None:
         """Show a step of a running simulation, delayed to the playback speed."""
@@ -122,129 +163,6 @@ class Live:
 
     def wait(self) -> None:
         """Wait until the viewer is closed, or until Ctrl-C."""
-        self._server.wait()
-
-    def close(self) -> None:
-        """Close the viewer; the page then reports the lost connection."""
-        self._server.close()
-
-    def __enter__(self) -> Live:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _forward(self, command: bytes) -> None:
-        # Until the server exists, the recorder only stores commands.
-        if hasattr(self, "_server"):
-            self._server.send(command)
-
-    def _asked(self, message: Request) -> None:
-        q = self.q.copy()
-        if message.get("neutral"):
-            q[7:] = self.robot.neutral()[7:]
-        wanted = dict(message.get("joints", {}))
-        if message.get("random"):
-            uniform = np.random.default_rng().uniform
-            wanted = {each["name"]: uniform(each["low"], each["high"]) for each in self._joints}
-        for name, value in wanted.items():
-            self.robot.joint(name).place(q, float(value))
-        self.robot.follow(q)
-        self.show(q)
-
-
-class Slider(TypedDict):
-    """Slider of a joint on the page, with its range [rad|m|kg^0.5 m]."""
-
-    name: str
-    low: float
-    high: float
-    length: bool  # whether the joint is prismatic
-
-
-def _joints(robot: Robot) -> list[Slider]:
-    """Return name and range of the slider of each joint except wheels."""
-    model = robot.model
-    found = list[Slider]()
-    for joint in robot.joints:
-        if joint.name in robot.wheels:
-            continue
-        high = 1.0 if joint.prismatic else np.pi
-        low = -high
-        if not joint.unbounded:
-            low = max(float(model.lowerPositionLimit[joint.idx_q]), low)
-            high = min(float(model.upperPositionLimit[joint.idx_q]), high)
-            if not low < high:
-                low, high = low - 1.0, low + 1.0
-        found.append({"name": joint.name, "low": low, "high": high, "length": joint.prismatic})
-    return found
-
-
-class Server:
-    """Server of a page and its updates; it stops when its process ends."""
-
-    def __init__(
-        self,
-        page: str,
-        scene: Callable[[], Iterable[bytes]],  # returns the commands for a new browser
-        asked: Callable[[Request], None],  # is called with each message of a browser
-        port: int,  # 0 for a free port
-    ) -> None:
-        self.page, self.scene, self.asked = page, scene, asked
-        self.state = "{}"
-        self.clients: set[_Socket] = set()
-        try:
-            listener = socket.create_server((_HOST, port), backlog=128)
-        except OSError as error:
-            why = os.strerror(error.errno or 0)
-            raise InputError(
-                f"port {port} is not available: {why}; give another port, or 0 for a free port"
-            ) from None
-        listener.setblocking(False)
-        self.port: int = listener.getsockname()[1]
-        self.url = f"http://{_HOST}:{self.port}/"
-        self.hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
-        given = {"server": self}
-        application = Application(
-            [("/", _Page, given), ("/socket", _Socket, given)],
-            log_function=lambda _: None,
-            websocket_ping_interval=20,
-        )
-        started = threading.Event()
-
-        async def run() -> None:
-            self._loop = asyncio.get_running_loop()
-            self._stop = asyncio.Event()
-            server = HTTPServer(application)
-            server.add_socket(listener)
-            started.set()
-            await self._stop.wait()
-            self._running = False
-            server.stop()
-            for client in list(self.clients):
-                client.close()
-            await server.close_all_connections()
-
-        self._running = True
-        self._thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
-        self._thread.start()
-        started.wait()
-
-    def send(self, message: bytes) -> None:
-        """Send a message to every browser."""
-        self._call(lambda: [client.send(message) for client in list(self.clients)])
-
-    def update(self, state: str) -> None:
-        """Send a state to every browser; slow browsers skip states that are out of date."""
-        self.state = state
-        self._call(self._update_all)
-
-    def _update_all(self) -> None:
-        for client in list(self.clients):
-            client.update()
-
-    def wait(self) -> None:
-        """Wait until the server is closed, or until Ctrl-C."""
         try:
             # Some platforms do not handle Ctrl-C during a wait without timeout.
             while self._thread.is_alive():
@@ -253,24 +171,66 @@ class Server:
             self.close()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Close the viewer; the page then reports the lost connection."""
         self._call(self._stop.set)
         self._thread.join(5.0)
 
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _send(self, message: bytes) -> None:
+        """Send a message to every browser."""
+        self._each(lambda client: client.send(message))
+
+    def _each(self, what: Callable[[_Socket], object]) -> None:
+        self._call(lambda: [what(client) for client in list(self._clients)])
+
     def _call(self, what: Callable[[], object]) -> None:
-        if self._running and self._thread.is_alive():
+        if self._running:
             with contextlib.suppress(RuntimeError):  # the server was just closed
                 self._loop.call_soon_threadsafe(what)
+
+    def _asked(self, message: Request) -> None:
+        q = self.q.copy()
+        if message.get("neutral"):
+            q[7:] = self.robot.neutral()[7:]
+        wanted = dict(message.get("joints", {}))
+        if message.get("random"):
+            uniform = np.random.default_rng().uniform
+            wanted = {name: uniform(*ends) for name, ends in self._ranges.items()}
+        for name, value in wanted.items():
+            self.robot.joint(name).place(q, float(value))
+        self.robot.follow(q)
+        self.show(q)
+
+
+def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
+    """Return {joint: range of its slider [rad|m|kg^0.5 m]} for all joints except wheels."""
+    found = {}
+    for joint in robot.joints:
+        high = 1.0 if joint.prismatic else np.pi
+        low = -high
+        if not joint.unbounded:
+            low = max(float(robot.model.lowerPositionLimit[joint.idx_q]), low)
+            high = min(float(robot.model.upperPositionLimit[joint.idx_q]), high)
+            if not low < high:
+                low, high = low - 1.0, low + 1.0
+        if joint.name not in robot.wheels:
+            found[joint.name] = low, high
+    return found
 
 
 class _Guarded(RequestHandler):
     """Handler that accepts only this machine's names as host, and so refuses other sites' pages."""
 
-    def initialize(self, server: Server) -> None:
-        self._server = server
+    def initialize(self, live: Live) -> None:
+        self._live = live
 
     def prepare(self) -> None:
-        if self.request.host not in self._server.hosts:
+        if self.request.host not in self._live._hosts:
             raise HTTPError(403)
 
     def set_default_headers(self) -> None:
@@ -280,7 +240,7 @@ class _Guarded(RequestHandler):
 class _Page(_Guarded):
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
-        self.write(self._server.page)
+        self.write(self._live._html)
 
 
 class _Socket(_Guarded, WebSocketHandler):
@@ -290,21 +250,21 @@ class _Socket(_Guarded, WebSocketHandler):
     _behind = False
 
     def check_origin(self, origin: str) -> bool:
-        return origin.partition("://")[2] in self._server.hosts
+        return origin.partition("://")[2] in self._live._hosts
 
     def open(self, *_: str, **__: str) -> None:
-        self._server.clients.add(self)
-        for message in self._server.scene():
+        self._live._clients.add(self)
+        for message in self._live._page.window.commands():
             self.send(message)
         self.update()
 
     def on_close(self) -> None:
-        self._server.clients.discard(self)
+        self._live._clients.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
         # Invalid messages are ignored, and too deeply nested messages close the connection.
         try:
-            self._server.asked(json.loads(message))
+            self._live._asked(json.loads(message))
         except (FflinError, ValueError, TypeError, AttributeError, ArithmeticError):
             return
         except RecursionError:
@@ -320,7 +280,7 @@ class _Socket(_Guarded, WebSocketHandler):
         if self._busy:
             self._behind = True
             return
-        sent = self.send(self._server.state)
+        sent = self.send(self._live._state)
         if sent is None:
             return
         self._busy = True

@@ -306,18 +306,17 @@ def mode_page(
     page.draw(robot, "rest", "ghost").place(at_rest)
     page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
     swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
-    energies = energies_of(robot, lin, [mode.shape for mode in found.vibrations])
     points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
     modes = [
         {
             "frequency": mode.frequency,
             "damping": mode.damping_ratio,
             "unstable": bool(mode.unstable),
-            "energy": list(energy.items())[:2],
+            "energy": list(energies_of(robot, lin, mode.shape)[0].items())[:2],
             "shape": _shape(mode, lin),
             "poses": packed(poses),
         }
-        for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
+        for mode, poses in zip(found.vibrations, swings, strict=True)
     ]
     corners = np.concatenate(points)
     html = page.html("modes", corners, period=_PERIOD, bodies=page.nodes, modes=modes)

@@ -299,7 +299,7 @@ def test_a_rod_that_buckles_has_the_rate_derived_by_hand(f):
 def test_models_from_files_and_in_other_hands(tmp_path):
     robot = two_panels(stiffness=5.0)
     lin = fflin.linearize(robot)
-    for ending in (".npz", ".mat", ".json", ".csv"):
+    for ending in (".npz", ".mat", ".json"):
         lin.save(tmp_path / f"m{ending}")
         loaded = fflin.modes(fflin.LinearModel.load(tmp_path / f"m{ending}"))
         assert (loaded.frequencies == fflin.modes(lin).frequencies).all()
@@ -437,8 +437,8 @@ def test_energy_does_not_depend_on_the_frame_of_the_base_or_the_scale():
         for mode, same in zip(given.modes, other.modes, strict=True):
             assert same.energy == pytest.approx(mode.energy, abs=1e-9)
     lin = given.lin
-    twice = energies_of(lin._robot, lin, [(2.0 - 3.0j) * mode.shape for mode in given.modes])
-    for mode, (same, _) in zip(given.modes, twice, strict=True):
+    for mode in given.modes:
+        same, _ = energies_of(lin._robot, lin, (2.0 - 3.0j) * mode.shape)
         assert same == pytest.approx(mode.energy, abs=1e-14)
 
 

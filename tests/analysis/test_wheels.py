@@ -8,8 +8,8 @@ import pytest
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
+from fflin.analysis.controllability import require_detectable, require_stabilizable
 from fflin.analysis.reduction import regulated_part, without
-from fflin.analysis.stabilizability import require_detectable, require_stabilizable
 from tests.support.robots import FRAMES, random_pose, random_tree
 from tests.support.wheels import AXES, carrier_alone, unit, wheels
 

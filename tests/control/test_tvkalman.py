@@ -124,7 +124,7 @@ def test_filters_are_kept(moving, tmp_path, ending):
     for item in fields(schedule):
         assert np.array_equal(getattr(schedule, item.name), getattr(back, item.name)), item.name
     assert (back.gain(0.1) == schedule.gain(0.1)).all()
-    start = "FilterSchedule('astrobee_arm', knots=3, nx=16, ny=14, dt=0.2 s, residual="
+    start = "FilterSchedule('astrobee_arm', knots=3, nx=16, nu=8, ny=14, dt=0.2 s, residual="
     assert repr(schedule).startswith(start)
 
 

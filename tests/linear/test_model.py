@@ -83,7 +83,7 @@ def test_equilibrium_is_told_from_motion(rest, moving):
 
 
 def test_repr_says_what_it_is(rest):
-    assert repr(rest) == "LinearModel('ets_vii', nx=24, nu=12, frame='hybrid', continuous)"
+    assert repr(rest) == "LinearModel('ets_vii', nx=24, nu=12, ny=24, frame='hybrid', continuous)"
     assert "dt=0.1 s" in repr(rest.discretize(0.1))
 
 

@@ -114,7 +114,7 @@ def test_it_survives_a_thousand_reconnects(live):
 
     before = count()
     run(reconnect())
-    wait_until(lambda: not live._server.clients, "the end of the last connection")
+    wait_until(lambda: not live._clients, "the end of the last connection")
     assert count() <= before + 5
     with urllib.request.urlopen(live.url) as answer:
         assert answer.status == 200
@@ -183,7 +183,7 @@ def test_a_running_simulation_is_shown_as_it_runs(robots):
         live.show = lambda q, t: (seen.append((t, q.copy(), time.monotonic())), show(q, t))
         begun = time.monotonic()
         motion = fflin.simulate(robot, v0=v, duration=2.0, callback=live)
-        assert json.loads(live._server.state)["time"] == pytest.approx(2.0)
+        assert json.loads(live._state)["time"] == pytest.approx(2.0)
     assert [t for t, _, _ in seen] == motion.t.tolist()
     assert (np.array([q for _, q, _ in seen]) == motion.q).all()
     for t, _, when in seen:  # a quarter of a second for each second
@@ -203,13 +203,13 @@ def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
         lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
         lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "", ""]
         slow.sendall("\r\n".join(lines).encode())
-        wait_until(lambda: live._server.clients, "the connection")
+        wait_until(lambda: live._clients, "the connection")
         last = 20_000
         for k in range(last + 1):
             live.show(q, k)
-        total = last * len(live._server.state)
+        total = last * len(live._state)
         slow.settimeout(STALL)
-        final = live._server.state.encode()
+        final = live._state.encode()
         assert json.loads(final)["time"] == last
         received, tail = 0, b""
         while tail != final:
@@ -242,7 +242,7 @@ def test_it_ends_with_close_and_leaves_no_thread(robots):
 PROGRAM = """
 import fflin
 live = fflin.visualize(fflin.load("cubesat"), open=False)
-server = live._server._thread
+server = live._thread
 join = server.join
 def say_that_it_waits(*seconds):
     server.join = join

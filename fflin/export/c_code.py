@@ -1,0 +1,465 @@
+"""C code of a control law: its source, header and test program, and a policy that calls it."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base import __version__
+from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.record import content_digest, reading
+from fflin.base.validation import Array
+from fflin.base.writing import as_path, read_file, write_atomically
+from fflin.control.policies import Loop, Policy, Sample
+from fflin.dynamics.coordinates import frame_of
+from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.state import Actuation, StateMap
+from fflin.export.laws import CASES, Law, law_of, measured
+from fflin.linear.fit import require_same, require_turns, sensed
+from fflin.robot.robot import Robot
+
+_DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
+_FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
+
+# Largest accepted rounding error in double precision, relative to the magnitudes of the terms.
+_DOUBLE_ERROR = 1e-14
+
+_INVALID = 2  # status of a step with invalid arguments
+
+
+def write_c(
+    law: object,
+    folder: str | Path,
+    *,
+    robot: Robot | None = None,
+    limits: object = None,
+    name: str = "controller",
+    real: str = "double",
+) -> Path:
+    r"""Write a control law as C99 code, with a test program.
+
+    The function writes the code to ``NAME.h`` and ``NAME.c``, the test program to ``NAME_test.c``,
+    and a description that `CLaw` reads to ``NAME.json``. The code calls no library function except
+    ``sqrt``, allocates no memory and has no global variables. The header describes each entry of
+    the arguments.
+
+    The code's function ``NAME_step`` computes the inputs of one sample:
+
+    - For a state feedback, the arguments are the measured attitude, position, joint angles and
+      velocities. ``NAME_step`` computes the state in the same way as `StateMap`, then the inputs
+      from the state.
+    - For an output feedback, the arguments are the outputs y, and the controller memory, which the
+      caller allocates.
+    - For gains along a trajectory, the sample number is an additional argument.
+
+    Parameters
+    ----------
+    law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
+        Control law; a `Compensator` or `TrajectoryFeedback` is also accepted. Controllers and gains
+        along a trajectory must be in discrete time.
+    folder : path
+        Folder for the files; created if it does not exist. Existing files with the same names are
+        replaced only if they were written for the same type of law and the same robot.
+    robot : Robot, optional
+        Robot that the law controls. Give the robot only if the law was read from a file and `load`
+        does not know the robot's name in this file.
+    limits : "urdf", float, mapping or list, optional
+        Limits at which the inputs saturate, as in `simulate`; none by default.
+    name : str
+        Prefix of the file names and of all names in the C code.
+    real : {"double", "float"}
+        Floating-point type of the C code.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        If one of these conditions is true:
+
+        - the law cannot be written in C;
+        - the robot of the law is not known;
+        - existing files with the same names were not written for the same law and robot;
+        - an argument is invalid.
+    FileError
+        If a file cannot be written.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> gain = fflin.lqr(fflin.linearize(robot))
+    >>> folder = fflin.write_c(gain, "flight")
+    >>> sorted(path.name for path in folder.iterdir())
+    ['controller.c', 'controller.h', 'controller.json', 'controller_test.c']
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
+        raise InputError(
+            f"name is {name!r}, expected a letter and then letters, digits or _, for names in C"
+        )
+    if not isinstance(real, str) or real not in ("double", "float"):
+        raise InputError(f"real is {real!r}, expected 'double' or 'float'")
+    target = as_path(folder)
+    title, texts = _texts(law_of(law, robot, limits), name, real)
+    contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
+    old = next((path for path in contents if path.exists()), None)
+    there = None
+    with suppress(OSError, ValueError, TypeError, LookupError):
+        there = json.loads((target / f"{name}.json").read_bytes())["title"]
+    if old and there != title:
+        raise InputError(
+            f"{old} exists and does not belong to the {title}; give another name= (--name) or "
+            "another folder, or delete the file"
+        )
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be made: {error.strerror}") from None
+    write_atomically(contents)
+    return target
+
+
+def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
+    """Return the digest that shows whether a law's description and code belong together."""
+    parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
+    return content_digest(parts)
+
+
+class CLaw:
+    """Policy that compiles C code written by `write_c` and calls it.
+
+    The C compiler of the system (``cc``) compiles the code to a shared library in a temporary
+    folder.
+
+    Parameters
+    ----------
+    folder : path
+        Folder that `write_c` wrote.
+    name : str, optional
+        The `name` given to `write_c`; required only if the folder contains several control laws.
+    compiler : str
+        Command that runs the C compiler.
+
+    Attributes
+    ----------
+    name : str
+        The `name` given to `write_c`, with which all names in the C code begin.
+    dt : float
+        Sampling time [s] of the control law; 0 in continuous time.
+    frame : str
+        Axes of the inputs on the base, as in `LinearModel`.
+    origin : pin.SE3 or None
+        Placement relative to which the state and the inputs on the base are measured.
+
+    Raises
+    ------
+    FileError
+        If the folder contains no law, contains several laws and `name` is omitted, or contains
+        edited files.
+    MissingPackageError
+        If there is no C compiler.
+    InputError
+        If the code cannot be compiled, or was written from a `Compensator`, which contains no
+        model.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> gain = fflin.lqr(fflin.linearize(robot))
+    >>> policy = fflin.CLaw(fflin.write_c(gain, "flight"))
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> fflin.simulate(robot, policy, v0=v0, duration=1.0).u.shape[1]
+    9
+    """
+
+    def __init__(
+        self, folder: str | Path, *, name: str | None = None, compiler: str = "cc"
+    ) -> None:
+        source = as_path(folder).resolve()
+        self._made = partial(CLaw, source, name=name, compiler=compiler)
+        found = [
+            path.stem
+            for path in source.glob("*.json")
+            if path.with_suffix(".c").is_file() and name in (None, path.stem)
+        ]
+        if len(found) != 1:
+            raise FileError(
+                f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
+                "that fflin.write_c wrote; if there are several pairs, choose one with name="
+            )
+        [self.name] = found
+        about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
+        with reading(about, "description of C code"):
+            self._about: dict[str, Any] = json.loads(read_file(about, ".json"))
+            digest = self._about.pop("sha256")
+            texts = read_file(header, ".h"), read_file(code, ".c")
+        if digest != digest_of(self._about, *texts):
+            raise FileError(
+                f"{about}: does not belong to {code.name} and {header.name}, or one of these files "
+                "was edited; write them again with fflin.write_c"
+            )
+        self.dt: float = self._about["dt"]
+        self.frame: str = self._about["frame"]
+        placement = self._about["reference"]
+        self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
+        if self._about["kind"] == "output" and placement is None:
+            raise InputError(
+                "the C code was written from a Compensator, which does not contain the model and "
+                "its outputs; write the C code from an OutputFeedback"
+            )
+        self._real = np.float64 if self._about["real"] == "double" else np.float32
+        self._step = getattr(_compiled(code, compiler), f"{self.name}_step")
+
+    def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
+        return self._made, ()  # compiled again, since a loaded library cannot be copied
+
+    def __repr__(self) -> str:
+        about = self._about
+        return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return the function policy(t, q, v) -> u for a robot.
+
+        Each call of `bind` returns a policy with a separate controller memory.
+
+        Raises
+        ------
+        InputError
+            If the robot and the C code have different states, inputs or outputs.
+        """
+        made = f"the C code '{self.name}' was made from the {self._about['title']}"
+        state = StateMap(robot, reference=self.origin, frame=frame_of(robot, self.frame))
+        actuation = Actuation(state)
+        there = {
+            "input": (actuation.names, actuation.units),
+            "state": (state.names, state.units),
+            "output": sensed(state),
+        }
+        for kind, (names, units) in self._about["signals"].items():
+            require_same(made, robot, kind, (tuple(names), tuple(units)), there[kind])
+        require_turns(made, self._about["nq"], robot)
+        if self._about["kind"] == "output":
+            return _OutputLoop(self, state)
+        world, n = StateMap(robot, frame=state.frame), robot.n
+        # C has no empty arrays, so an array for joints has at least one entry.
+        given, u = (
+            np.zeros(13 + 2 * max(n, 1), self._real),
+            np.zeros(len(actuation.names), self._real),
+        )
+        at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
+        samples = self._about["kind"] == "samples"
+
+        def policy(t: float, q: Array, v: Array) -> Array:
+            given[at] = measured(world, q, v)
+            sample = (ctypes.c_ulong(round(t / self.dt)),) if samples else ()
+            self.call(t, *sample, given.ctypes, u.ctypes)
+            return u.astype(float)
+
+        return policy
+
+    def call(self, t: float, *arguments: object) -> None:
+        """Call the C code at time t [s], or raise `InputError` if an argument is invalid."""
+        if self._step(*arguments) == _INVALID:
+            raise InputError(
+                f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
+                "finite or too large"
+            )
+
+
+class _OutputLoop(Loop):
+    """Control loop that calls the C code as its controller."""
+
+    def __init__(self, law: CLaw, state: StateMap) -> None:
+        about = law._about
+        q, v = map(np.array, about["point"])
+        there = Measuring(state, q), state.read(q, v)
+        super().__init__(state, law.dt, None, about["memory"], lambda _: None, lambda _: there)
+        self._law, self._u0 = law, np.array(about["u0"])
+
+    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
+        """Return the command of a sample.
+
+        Outputs are measured twice, because an accelerometer measures accelerations under this
+        command.
+        """
+        real, u = self._law._real, self._u0
+        for _ in range(2):
+            memory, out = np.append(self.estimate, 0.0).astype(real), np.zeros(len(u), real)
+            y = measure(self.at(t), u).astype(real)
+            self._law.call(t, memory.ctypes, y.ctypes, out.ctypes)
+            u = out.astype(float)
+        self.estimate = memory[:-1].astype(float)
+        return u
+
+
+def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
+    """Compile a source file, and return its shared library."""
+    if not isinstance(compiler, str) or "\0" in compiler:
+        raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
+    command = shutil.which(compiler)
+    if command is None:
+        raise MissingPackageError(
+            f"there is no C compiler '{compiler}'; install one, such as gcc, or give compiler="
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "law.so"
+        flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
+        done = subprocess.run(
+            [command, *flags, "-o", str(library), str(source), "-lm"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
+            raise InputError(f"{source}: cannot be compiled: {line}")
+        try:
+            return ctypes.CDLL(str(library))
+        except OSError as error:
+            raise InputError(f"'{compiler}' made no library from {source}: {error}") from None
+
+
+def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
+    """Return the title of a law, and {ending: text} of its files, made from the templates."""
+    state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
+    names, units = law.inputs
+    kind, title = "state" if state else "output", f"{law.title} of '{robot.name}'"
+    frame = state.frame if state else lin.frame if lin else ""
+    # For single precision, the bound is the unit roundoff times the number of operations.
+    error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
+    bounds = error * np.max([case.scale for case in law.cases], axis=0)
+    sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
+    array = partial(_array, real=real)
+    vectors = []
+    for case in law.cases:
+        out = case.out.copy()
+        out[: len(names)] = np.clip(out[: len(names)], tables["low"], tables["high"])
+        numbers = map(array, (case.given, out, error * case.scale))
+        status = int((out != case.out).any())
+        vectors.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
+    outs = [*map(_plain, names), *(f"next z[{k}]" for k in range(len(out) - len(names)))]
+    words: dict[str, object] = {
+        **(_DOUBLE if real == "double" else _FLOAT),
+        **{key: array(table) for key, table in tables.items()},
+        "continuous": array(np.array(law.continuous, dtype=bool)),
+        **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
+        **{"law": law.title, "frame": frame or "not known", "robot": _plain(robot.name)},
+        "sha256": robot.urdf_sha256 or "not known",
+        "world": ", the orbital frame" if robot.orbit else "",
+        **{"fflin_version": __version__, "pinocchio_version": pin.__version__},
+        "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
+        "error": f"{error:.2g}",
+        "tolerances": _listed("u", names, sizes),
+        **{"inputs": len(names), "input_list": _listed("u", names, units), "row": "0"},
+        f"{kind}_list": _listed("x" if state else "y", *law.signals),
+        "vectors": "{\n" + ",\n".join(vectors) + "}",
+        **{"ins": len(case.given), "outs": len(outs)},
+        "out_names": ",\n".join(f'    "{each}"' for each in outs),
+    }
+    if state:
+        words |= _state_words(law, state)
+        words["interpolation"] = _filled("interpolation.c", words) if "axis_size" in tables else ""
+    else:
+        nz = len(tables["A"])
+        words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
+    words["interface"] = _filled(f"{kind}_interface.h", words)
+    words["limiting"] = _filled("limiting.c", words).rstrip()
+    words["run"] = _filled(f"{kind}_run.c", words)
+    header, source = _filled("header.h", words), _filled(f"{kind}_law.c", words)
+    about: dict[str, object] = {
+        **{"title": title, "real": real, "frame": frame, "dt": law.dt},
+        "kind": "samples" if len(tables["u0"]) > 1 else kind,
+        "signals": {"input": law.inputs, kind: law.signals},
+        "nq": len(lin.q) if lin else robot.nq,
+        "u0": tables["u0"][0].tolist(),
+        "memory": 0 if state else len(tables["A"]),
+        "reference": None if lin is None else lin.placement.tolist(),
+        "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+    }
+    about["sha256"] = digest_of(about, header.encode(), source.encode())
+    described = json.dumps(about, indent=1) + "\n"
+    test = _filled("test.c", words)
+    return title, {".h": header, ".c": source, "_test.c": test, ".json": described}
+
+
+def _state_words(law: Law, state: StateMap) -> dict[str, object]:
+    """Return the words of a state law alone."""
+    n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
+    words: dict[str, object] = {
+        **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
+        **{"rows": rows, "gains": len(law.tables["K"])},
+        "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
+        **dict.fromkeys(("gains_between", "sample_argument", "sample_given"), ""),
+        **{"sample_comment": "", "feedback": "feed_back(0, 1, x, u);"},
+    }
+    if rows > 1:
+        words |= {
+            "sample_argument": "unsigned long sample, ",
+            "sample_given": "given->sample, ",
+            "sample_comment": "sample counts sample times from the start, 0.",
+            "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
+            "feedback": "feed_back((int)row, 1, x, u);",
+        }
+    if points is not None:
+        axes, room = points.shape
+        words |= {
+            **{"axis_count": axes, "axis_room": room, "corners": 2**axes},
+            "feedback": "feed_back_between(measured, x, u);",
+            "gains_between": ", K interpolated linearly between joint angles",
+        }
+    return words
+
+
+def _filled(template: str, words: dict[str, object]) -> str:
+    text = files("fflin.export").joinpath("templates", template).read_text("utf-8")
+    return Template(text).substitute(words)
+
+
+def _array(values: Array, real: str) -> str:
+    """Return the C initialiser of an array."""
+    # C has no empty arrays: an array without rows or columns gets a row or column of zeros.
+    values = np.pad(values, [(0, int(not size)) for size in values.shape])
+    if values.ndim > 1:
+        return "{\n" + ",\n".join(_array(row, real) for row in values) + "}"
+    if values.dtype.kind != "f":
+        return "{" + ", ".join(str(int(x)) for x in values) + "}"
+    if real == "float":
+        with np.errstate(over="ignore"):
+            narrow = values.astype(np.float32)
+        if (np.isfinite(values) & ~np.isfinite(narrow)).any():
+            raise InputError(
+                "the law has numbers that are too large for a float; use real='double'"
+            )
+        values = narrow.astype(float)
+    end = "F" if real == "float" else ""
+    shown = ", ".join(f"{x!r}{end}" for x in values.tolist())
+    return "{" + shown.replace(f"inf{end}", "NO_LIMIT") + "}"
+
+
+def _plain(text: str) -> str:
+    """Replace the characters of a text that may be invalid in comments and strings of C."""
+    return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
+
+
+def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
+    """Return the lines of a C comment with index, name and unit of each entry of an array."""
+    return "\n".join(
+        f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
+        for k, (name, unit) in enumerate(zip(names, units, strict=True))
+    )
