@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Values, dimension, instance, number
+from fflin.base.validation import Array, Poles, Vector, dimension, instance, number
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
@@ -76,21 +76,19 @@ class Estimator(ModelDesign):
     (True, True)
     """
 
-    VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
-
     L: Array
     L_update: Array
     P: Array
-    poles: Values
+    poles: Poles
     residual: float
     margin: float
     C: Array
     D: Array
     W: Array
     V: Array
-    x0: Array
-    u0: Array
-    y0: Array
+    x0: Vector
+    u0: Vector
+    y0: Vector
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
 
@@ -138,12 +136,10 @@ class Compensator(ModelDesign):
     ((18, 18), True)
     """
 
-    VECTORS: ClassVar = ("poles", "y0", "u0")
-
     C: Array
-    poles: Values
-    y0: Array
-    u0: Array
+    poles: Poles
+    y0: Vector
+    u0: Vector
     output_names: tuple[str, ...]
 
     def to_control(self) -> control.StateSpace:

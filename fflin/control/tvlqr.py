@@ -6,7 +6,6 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -15,7 +14,7 @@ from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, instance, number
+from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import lqr
@@ -37,7 +36,7 @@ from fflin.robot.robot import Robot
 class Schedule(ModelDesign):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
-    t: Array
+    t: Vector
     P: Array
     residual: float
 
@@ -101,14 +100,12 @@ class GainSchedule(Schedule):
     >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
     """
 
-    VECTORS: ClassVar = ("t", "knots")
-
     K: Array
     Q: Array
     R: Array
     Qf: Array
     weights: str
-    knots: Array
+    knots: Vector
     q: Array
     v: Array
     u: Array
@@ -225,8 +222,6 @@ class FilterSchedule(Schedule):
     >>> filtered.dt, filtered.P.shape[1:]
     (0.1, (18, 18))
     """
-
-    VECTORS: ClassVar = ("t",)
 
     L: Array
     C: Array
