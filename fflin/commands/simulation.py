@@ -124,11 +124,11 @@ def view(arguments: Namespace) -> Report:
 def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
     """Raise an error before the simulation if `pictures` would refuse the options."""
     from fflin.simulation.plan import LONGEST
-    from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
+    from fflin.view.visualize import check_outputs, check_rates, check_times, tool_frame
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
-    check_tool(robot, arguments.tool)
+    tool_frame(robot, arguments.tool)
     duration = arguments.duration or LONGEST
     check_rates(arguments.fps, arguments.speed, duration)
     if arguments.times:

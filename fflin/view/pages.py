@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
-FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
-
 # Length of the largest force's arrow. The camera follows the base by default if its path is longer
 # than _FAR. Both are in robot sizes.
 ARROW, _FAR = 0.62, 20.0
@@ -150,42 +147,27 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
-    trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
+    trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
-        trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
+        trails, followed = {"base": film.poses[:, 0, :3]}, {"base": goals[:, 0, :3]}
     if page.tool:
-        trails.insert(0, ("tool", TOOL_COLOR, film.tool))
+        trails = {"tool": film.tool, **trails}
         if followed:
             joint, at = find_frame(page.robot.model, page.tool)
             ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
             followed["tool"] = np.array(ends)
-    arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
-    size = page.size
-    most = float(np.abs(film.thrust).max(initial=0.0))
     return {
-        "trails": [
-            {"name": name, "colour": color, "points": packed(points), "radius": 0.0055 * size}
-            for name, color, points in trails
-        ],
-        "followed": [
-            {"name": name, "points": packed(points), "radius": 0.004 * size}
-            for name, points in followed.items()
-        ],
+        "trails": [{"name": name, "points": packed(points)} for name, points in trails.items()],
+        "followed": [{"points": packed(points)} for points in followed.values()],
         "arrows": [
-            {
-                "kind": kind,
-                "longest": ARROW * size,
-                "colour": color,
-                "values": packed(values),
-                "most": float(np.linalg.norm(values, axis=1).max()),
-            }
-            for kind, color, values in arrows
+            {"kind": kind, "longest": ARROW * page.size, "values": packed(values)}
+            for kind, values in (("force", film.force), ("torque", film.torque))
             if np.any(values)
         ],
         "plumes": [
-            {**nozzle, "values": packed(film.thrust[:, k]), "most": most, "name": name}
-            for k, (name, nozzle) in enumerate(page.nozzles)
-            if most
+            {**nozzle, "values": packed(film.thrust[:, k])}
+            for k, nozzle in enumerate(page.nozzles)
+            if film.thrust.any()
         ],
     }
 

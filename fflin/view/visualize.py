@@ -157,8 +157,7 @@ def visualize(
     if not isinstance(scene, str) or scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     opened = None if open is None else truth("open", open)
-    check_tool(robot, tool)
-    tool = tool or default_tool(robot)
+    tool = tool_frame(robot, tool)
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
@@ -236,14 +235,11 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
     return outputs
 
 
-def check_tool(robot: Robot, tool: str | None) -> None:
-    """Raise `UnknownNameError` if the robot has no frame `tool`."""
+def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
+    """Return the frame `tool`; by default, "tool" or the last link of the longest chain."""
     if tool is not None:
         find_frame(robot.model, tool)
-
-
-def default_tool(robot: Robot) -> str | None:
-    """Return the name of the tool frame: "tool", or the last link of the longest chain."""
+        return tool
     model = robot.model
     if robot.n == 0:
         return None

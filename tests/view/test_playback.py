@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.page import thrusters
+from fflin.view.page import Page
 from fflin.view.pages import play_back
 from tests.support.robots import random_point, random_pose
 
@@ -79,8 +79,11 @@ def test_plumes_stand_where_thrusters_push(robots):
     robot = robots["servicer_7dof"].replace(inputs=[fflin.JointTorque("joint_1"), thruster])
     rng = np.random.default_rng(1)
     q, _, u = random_point(robots["servicer_7dof"], rng)
-    ((name, joint, position, direction),) = thrusters(robot)
+    (nozzle,) = Page(robot, "space", None, None).nozzles
+    name, path, position, direction = (nozzle[k] for k in ("name", "path", "position", "direction"))
     assert name == fflin.linearize(robot).input_names[1]
+    joint = robot.model.getJointId(path[-1])
+    position, direction = np.array(position), np.array(direction)
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, q)
     tool = data.oMf[robot.model.getFrameId("tool")]
