@@ -179,6 +179,8 @@ def visualize(
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     from fflin.analysis.modes import Modes
+    from fflin.view.page import Page
+    from fflin.view.pages import mode_page, motion_page
 
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
@@ -186,23 +188,18 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        from fflin.view.pages import mode_page
-
-        page, notes = mode_page(robot, motion, scene=scene, tool=tool)
+        found, notes = mode_page(Page(robot, scene, tool, motion.lin.frame), motion)
     else:
         robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-        from fflin.view.pages import motion_page
-
         goal = None if target is None else _configuration(robot, "target", target)
-        page, notes = motion_page(
-            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
-        )
-        contents = _pictures(page, outputs, motion, speed, times)
+        page = Page(robot, scene, tool, motion.frame)
+        found, notes = motion_page(page, motion, fps=fps, speed=speed, follow=follow, target=goal)
+        contents = _pictures(found, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
-    write_atomically(contents | ({shown: page.encode()} if shown else {}))
+    write_atomically(contents | ({shown: found.encode()} if shown else {}))
     if shown and (not outputs if opened is None else opened):
         import webbrowser
 
