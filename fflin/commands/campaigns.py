@@ -134,12 +134,12 @@ def sweep(arguments: Namespace) -> Report:
     example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
     """
     from fflin.batch.files import part_of
-    from fflin.batch.sweep import planned_bytes
+    from fflin.batch.sweep import ChunkJob
 
     path, robot = arguments.output_file, load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
     q, v, u = _points(robot, arguments)
-    size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
+    size = len(q) * ChunkJob(robot, at_rest=v is None and u is None, **settings).row_bytes
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"

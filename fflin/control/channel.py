@@ -12,9 +12,9 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
-from fflin.kernel import channel as rules
-from fflin.kernel.arguments import empty
-from fflin.kernel.channel import PULSES, WHEELS, Pulses, Wheels
+from fflin.kernel import loop as rules
+from fflin.kernel.loop import PULSES, WHEELS, Pulses, Wheels
+from fflin.kernel.tree import empty
 from fflin.robot.fields import Range, input_limits, pulsed_thrusters
 from fflin.robot.inputs import named_inputs
 from fflin.robot.robot import Robot

@@ -7,7 +7,7 @@ import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
-from fflin.base.validation import Array, Mask, Values
+from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
@@ -93,11 +93,9 @@ class Gain(Design):
     True
     """
 
-    VECTORS: ClassVar = ("poles", "x0", "u0", "placement")
-
     K: Array
     P: Array
-    poles: Values
+    poles: Poles
     residual: float
     margin: float
     method: str
@@ -106,8 +104,8 @@ class Gain(Design):
     Q: Array
     R: Array
     N: Array
-    x0: Array
-    u0: Array
+    x0: Vector
+    u0: Vector
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -117,7 +115,7 @@ class Gain(Design):
     robot: str
     weights: str
     regulated: tuple[str, ...]
-    placement: Array
+    placement: Vector
     urdf_sha256: str
     # The model of the design; files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.record import Design
-from fflin.base.validation import Array, Values, dimension, instance, number
+from fflin.base.validation import Array, Poles, Vector, dimension, instance, number
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
@@ -78,12 +78,10 @@ class Estimator(Design):
     (True, True)
     """
 
-    VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
-
     L: Array
     L_update: Array
     P: Array
-    poles: Values
+    poles: Poles
     residual: float
     margin: float
     A: Array
@@ -92,9 +90,9 @@ class Estimator(Design):
     D: Array
     W: Array
     V: Array
-    x0: Array
-    u0: Array
-    y0: Array
+    x0: Vector
+    u0: Vector
+    y0: Vector
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -146,14 +144,12 @@ class Compensator(Design):
     ((18, 18), True)
     """
 
-    VECTORS: ClassVar = ("poles", "y0", "u0")
-
     A: Array
     B: Array
     C: Array
-    poles: Values
-    y0: Array
-    u0: Array
+    poles: Poles
+    y0: Vector
+    u0: Vector
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]

@@ -6,7 +6,6 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -16,7 +15,7 @@ from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.record import Design
 from fflin.base.tables import folded
-from fflin.base.validation import Array, instance, number
+from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
@@ -38,7 +37,7 @@ from fflin.robot.robot import Robot
 class Schedule(Design):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
-    t: Array
+    t: Vector
     P: Array
     dt: float
 
@@ -102,8 +101,6 @@ class GainSchedule(Schedule):
     >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
     """
 
-    VECTORS: ClassVar = ("t", "knots")
-
     K: Array
     A: Array
     B: Array
@@ -115,7 +112,7 @@ class GainSchedule(Schedule):
     input_names: tuple[str, ...]
     robot: str
     weights: str
-    knots: Array
+    knots: Vector
     q: Array
     v: Array
     u: Array
@@ -232,8 +229,6 @@ class FilterSchedule(Schedule):
     >>> filtered.dt, filtered.P.shape[1:]
     (0.1, (18, 18))
     """
-
-    VECTORS: ClassVar = ("t",)
 
     L: Array
     A: Array

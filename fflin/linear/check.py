@@ -1,13 +1,12 @@
 """Check of A and B by ABA derivatives and by differences of the nonlinear model."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, frozen, instance, share
@@ -17,7 +16,7 @@ from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit, require_sensed
-from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.model import Certificate, LinearModel, refuse_sampled
 from fflin.linear.nonlinear import Nonlinear, jacobian
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.outputs import FullState
@@ -167,12 +166,8 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     (True, True)
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    if lin.dt:
-        raise InputError(
-            f"the model is sampled at dt = {lin.dt:g} s; check the continuous-time model instead"
-        )
-    found = _checked(robot, lin)
-    return found if tolerance is None else held_to(tolerance, found)
+    refuse_sampled(lin.dt, "check")
+    return held_to(tolerance, _checked(robot, lin))
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
@@ -199,7 +194,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     require_fit(lin, robot, state, whole=True)
     require_sensed(lin, robot, state)
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
-    aba, M, rows = Aba(state), inertia_matrix(robot, lin), list[Row]()
+    aba, M = Aba(state), inertia_matrix(robot, lin)
     A, B, aba_inverse = aba_route(aba, q, v, lin.u0, moving=lin.moving)
     scales = Scales(aba, lin, M, B)
 
@@ -210,8 +205,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     # as its M^-1, and the error of M^-1 is the residual of M M^-1 = I.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
-    for block, error in scales.errors(A, B).items():
-        rows.append(Row("ABA derivatives", block, error, by_aba))
+    rows = _rows("ABA derivatives", scales.errors(A, B), by_aba)
 
     model, nx, steps = Nonlinear(aba, lin), state.nx, scales.difference_steps()
     point = np.concatenate((lin.x0, lin.u0))
@@ -221,18 +215,13 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     slopes = jacobian(model.rates, point, steps, bends)
     rounding = _STEP_ULPS * _EPS / difference
     errors = scales.errors(slopes[:, :nx], slopes[:, nx:], steps=steps[:nx], rounding=rounding)
-    for block, error in errors.items():
-        rows.append(Row("differences", block, error, difference))
-    rows += _output_rows(model, lin, steps, difference)
+    rows += _rows("differences", errors, difference)
+    rows += _rows("outputs", _output_errors(model, lin, steps, difference), difference)
     rows.append(Row("flow", "f", model.flow_error(), difference))
 
     x0 = state.to_state(q, v, near=lin.x0)
     rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
-    rate, sizes = model.rates(point[None])[0], scales.rates()
-    for name, part in state.groups._asdict().items():
-        size = max(_largest(sizes[part]) or 1.0, _largest(rate[part]))
-        error = _largest(lin.f0[part] - rate[part]) / size
-        rows.append(Row("point", f"f0[{name}]", error, route))
+    rows += _rows("point", scales.rate_errors(model.rates(point[None])[0]), route)
 
     # With the default inputs, M^-1 is the lower half of B.
     inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
@@ -248,8 +237,14 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
 
 
-def _output_rows(model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float) -> list[Row]:
-    """Compare C, D and y0 with differences of the nonlinear outputs; return the rows."""
+def _rows(test: str, errors: Mapping[str, float], tolerance: float) -> list[Row]:
+    return [Row(test, block, error, tolerance) for block, error in errors.items()]
+
+
+def _output_errors(
+    model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float
+) -> dict[str, float]:
+    """Compare C, D and y0 with differences of the nonlinear outputs; return their errors."""
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
         errors = {"y0": lin.y0 - lin.x0, "C": lin.C - np.eye(nx), "D": lin.D}
@@ -267,10 +262,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, steps: Array, tolerance: fl
         for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
             largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
             errors[name] = (given - slopes[:, part]) / np.maximum(largest, noise[:, part])
-    rows = []
-    for name, error in errors.items():
-        rows.append(Row("outputs", name, _largest(error), tolerance))
-    return rows
+    return {name: _largest(error) for name, error in errors.items()}
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
@@ -409,9 +401,7 @@ class Scales:
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
         # Effect of a unit velocity at the present rates; for rotations, also at the present speed
         # of the base.
-        turning = rate * np.array(
-            [_largest(unit[ANGULAR]), _largest(unit[LINEAR]), _largest(unit[6:])]
-        )
+        turning = rate * np.array([_largest(x) for x in np.split(unit, (3, 6))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
         terms[:, 0] *= _largest(self._state.chart(lin.q).J)
@@ -429,12 +419,16 @@ class Scales:
             momentum += float(np.linalg.norm(stored))
         return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
-    def rates(self) -> Array:
-        """Return the sizes (nx,) of the largest terms of f0, which may cancel."""
+    def rate_errors(self, f0: Array) -> dict[str, float]:
+        """Compare with another f0, relative to its largest terms, which may cancel."""
         mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
         push = _largest(self._lin.u0 * self._input_mobility)
         push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)
-        return np.concatenate((np.ones(self._nv), mobility * push))
+        sizes, errors = np.concatenate((np.ones(self._nv), mobility * push)), dict[str, float]()
+        for name, part in self._state.groups._asdict().items():
+            size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
+            errors[f"f0[{name}]"] = _largest(self._lin.f0[part] - f0[part]) / size
+        return errors
 
     def difference_steps(self) -> Array:
         """Return the steps (nx + nu,) for differences in x and u at the model's point."""

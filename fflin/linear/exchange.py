@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array, instance, number, shaped, vector
+from fflin.base.validation import Array, Vector, instance, number, shaped, vector
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_fit
@@ -60,15 +60,13 @@ class ToolModel(StateSpace, Design):
     ((9, 18), ('theta.x', 'theta.y', 'theta.z'), 'fixed')
     """
 
-    VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
-
     tool: str
     robot: str
     T: Array
     T_left: Array
     T_u: Array
-    q: Array
-    v: Array
+    q: Vector
+    v: Vector
     reference: str
 
 
@@ -272,11 +270,11 @@ def from_tool(
             change = np.vstack((0.0 * change[:nv], change[nv:] / step))
         changes.append(change)
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
-    A, B = (
-        np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
-        for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True)
-    )
-    return replace(lin, A=A, B=B)
+    found = []
+    for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True):
+        noise = (old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max())
+        found.append(np.where(noise, 0.0, old + new))
+    return replace(lin, A=found[0], B=found[1])
 
 
 def _jacobians_at(

@@ -1,9 +1,9 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
-A model in csv consists of several tables: one for each matrix, with names of rows and columns; one
-each for the states, inputs and outputs; and the table ``info`` of all other entries, whose last
-line is the digest of all tables. In a trajectory in csv, every row of the last column repeats the
-digest of the other columns. So the file has no extra lines, and other programs can read the
+A model in csv consists of several tables for other programs, which fflin does not read: one for
+each matrix, with names of rows and columns; one each for the states, inputs and outputs; and the
+table ``info`` of all other entries. In a trajectory in csv, every row of the last column repeats
+the digest of the other columns. So the file has no extra lines, and other programs can read the
 columns by their names.
 """
 
@@ -60,9 +60,7 @@ _LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
-_PLAIN = (*_TEXTS, *_FIGURES)  # written as they are in the table ``info``; others as JSON
 _MATRICES = [key for key, of in _ARRAYS.items() if len(of) == 2]
-_TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
 
 T = TypeVar("T")
 
@@ -91,17 +89,29 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
         record.write_record(path, entries, checksummed=checksummed)
         return
     record.require_finite(entries)
-    contents = {key: csv_table(rows) for key, rows in _tables(entries).items()}
-    if checksummed:
-        contents["info"] += f"{record.CHECKSUM},{record.content_digest(contents)}\n".encode()
-    write_atomically({_csv_path(path, key): content for key, content in contents.items()})
+    names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
+    names["velocity"] = names["state"][-len(entries["M"]) :]
+    rest, tables = dict(entries), dict[str, list[list[object]]]()
+    for key in _MATRICES:
+        rows, columns = (names[each] for each in _ARRAYS[key])
+        body = zip(rows, rest.pop(key).tolist(), strict=True)
+        tables[key] = [["", *columns], *([name, *row] for name, row in body)]
+    for signal in _SIGNALS:
+        vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
+        keys = (f"{signal}_names", f"{signal}_units", *vectors)
+        lines = zip(*(np.asarray(rest.pop(key)).tolist() for key in keys), strict=True)
+        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
+    tables["info"] = [["name", "value"]]
+    for key, value in rest.items():
+        plain = value if key in (*_TEXTS, *_FIGURES) else json.dumps(np.asarray(value).tolist())
+        tables["info"].append([key, plain])
+    write_atomically({_csv_path(path, key): csv_table(rows) for key, rows in tables.items()})
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
     """Return the fields of a model, and its certificate; see `LinearModel.load`."""
-    check_ending(path, FORMATS)
     with reading(path, "linear model"):
-        entries, verified = _from_csv(path) if path.suffix == ".csv" else read_record(path)
+        entries, verified = read_record(path)
         fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
         fields |= {key: text(entries[key]) for key in _TEXTS}
         fields |= {key: figure(entries[key]) for key in _FIGURES}
@@ -140,58 +150,12 @@ def given(value: T, _: object) -> T:
     return value
 
 
-def _tables(entries: Record) -> dict[str, list[list[object]]]:
-    """Return the tables of a model's csv files as {name of the table: rows}."""
-    names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
-    names["velocity"] = names["state"][-len(entries["M"]) :]
-    rest, tables = dict(entries), dict[str, list[list[object]]]()
-    for key in _MATRICES:
-        rows, columns = (names[each] for each in _ARRAYS[key])
-        body = zip(rows, rest.pop(key).tolist(), strict=True)
-        tables[key] = [["", *columns], *([name, *row] for name, row in body)]
-    for signal in _SIGNALS:
-        vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
-        keys = (f"{signal}_names", f"{signal}_units", *vectors)
-        lines = zip(*(np.asarray(rest.pop(key)).tolist() for key in keys), strict=True)
-        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
-    tables["info"] = [["name", "value"]]
-    for key, value in rest.items():
-        plain = value if key in _PLAIN else json.dumps(np.asarray(value).tolist())
-        tables["info"].append([key, plain])
-    return tables
-
-
-def _from_csv(path: Path) -> tuple[Record, bool]:
-    """Return the entries of a model in csv, and whether their digest was verified."""
-    if not _csv_path(path, "info").exists() and path.exists():
-        raise ValueError("give the name NAME.csv without the matrix, not NAME.A.csv")
-    contents = {key: read_file(_csv_path(path, key), ".csv") for key in _TABLES}
-    body, mark, checksum = contents["info"].rpartition(f"\n{record.CHECKSUM},".encode())
-    if mark:
-        contents["info"] = body + b"\n"
-        if checksum != f"{record.content_digest(contents)}\n".encode():
-            raise ValueError(
-                f"{record.DAMAGED}; to read it as it is, delete that line of the info table"
-            )
-    entries: Record = {}
-    for key, content in contents.items():
-        header, *rows = list(csv.reader(io.StringIO(content.decode(), newline=""))) or [[]]
-        if key in _MATRICES:
-            entries[key] = [row[1:] for row in rows]
-        elif key == "info":
-            entries |= {name: x if name in _PLAIN else json.loads(x) for name, x in rows}
-        else:
-            columns = list(zip(*rows, strict=True)) or [()] * len(header)
-            of = (f"{key[:-1]}_names", f"{key[:-1]}_units", *header[2:])
-            entries |= zip(of, columns, strict=False)
-    return entries, bool(mark)
-
-
 def foreign_table(path: Path) -> Path | None:
     """Return a file that saving NAME.csv would overwrite and that no model wrote, or None."""
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
-    tables = [] if own else [_csv_path(path, key) for key in _TABLES]
+    keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
+    tables = [] if own else [_csv_path(path, key) for key in keys]
     return next((table for table in tables if table.is_file() and table.stat().st_size), None)
 
 

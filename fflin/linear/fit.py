@@ -28,16 +28,14 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool 
     A reduced model may lack states of the robot, unless the model must be `whole`.
     """
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
-    inputs = (lin.input_names, lin.input_units), (actuation.names, actuation.units)
-    if whole:
-        there = state.names, state.units
-        require_same(made, robot, "state", (lin.state_names, lin.state_units), there)
-    require_same(made, robot, "input", *inputs)
+    own, there = (lin.state_names, lin.state_units), (state.names, state.units)
     if not whole:
-        units = dict(zip(state.names, state.units, strict=True))
+        units = dict(zip(*there, strict=True))
         names = tuple(name for name in lin.state_names if name in units)
         there = names, tuple(units[name] for name in names)
-        require_same(made, robot, "state", (lin.state_names, lin.state_units), there)
+    require_same(made, robot, "state", own, there)
+    own, there = (lin.input_names, lin.input_units), (actuation.names, actuation.units)
+    require_same(made, robot, "input", own, there)
     require_turns(made, len(lin.q), robot)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +17,7 @@ from fflin.base.process import in_one_thread
 from fflin.base.validation import Array
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.linearization import Linearizer
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_sampled
 from fflin.linear.trajectory import Trajectory, intervals_of
 from fflin.robot.robot import Robot
 
@@ -93,16 +93,14 @@ class LinearTrajectory(Trajectory):
 
     def __getitem__(self, index: int) -> LinearModel:
         """Return the linear model at a knot."""
-        return self._model(range(len(self))[index])
-
-    def __iter__(self) -> Iterator[LinearModel]:
-        return map(self._model, range(len(self)))
-
-    def _model(self, k: int) -> LinearModel:
+        k = range(len(self))[index]
         lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         own = {name: getattr(self, name)[k] for name in "ABCD"}
         lin = lin.discretize(self.dt) if self.dt else lin
         return replace(lin, **own, y0=self.y[k], verified=self.verified)
+
+    def __iter__(self) -> Iterator[LinearModel]:
+        return map(self.__getitem__, range(len(self)))
 
     @cached_property
     def _linearizer(self) -> Linearizer:
@@ -160,11 +158,7 @@ class LinearTrajectory(Trajectory):
         InputError
             If the duration is not a multiple of dt, or the model is already in discrete time.
         """
-        if self.dt:
-            raise InputError(
-                f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
-                "continuous-time model"
-            )
+        refuse_sampled(self.dt, "discretize")
         found = np.array([transition for _, transition in transitions(self, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
@@ -243,11 +237,10 @@ def linearize_trajectory(
 def along(motion: Trajectory) -> LinearTrajectory:
     """Return the linear models along a motion."""
     linearizer = Linearizer(motion.robot, moving=True)
-    found: dict[str, Any] = {item.name: getattr(motion, item.name) for item in fields(Trajectory)}
-    found |= linearizer.along(motion.q, motion.v, motion.u_base)
+    found: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
     for key in ("state_names", "input_names", "output_names"):
         found[key] = linearizer.prepared.common[key]
-    made = LinearTrajectory(**found)
+    made = LinearTrajectory._of(motion, **found, dt=0.0)
     for name in ("interval_errors", "cubics"):
         if name in vars(motion):  # keep cached results of the same motion
             vars(made)[name] = vars(motion)[name]

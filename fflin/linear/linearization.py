@@ -120,20 +120,8 @@ class Prepared:
         """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
         return frozen(pin.SE3ToXYZQUAT(self.map.reference))
 
-    @property
-    def fields(self) -> dict[str, object]:
-        """Fields of a model at rest except B and q; slow ones are computed at their first use."""
-        asked = {
-            "x0": self._state_at,
-            "y0": self._state_at,
-            "_reference": partial(own_reference, self.robot),
-        }
-        fields = {**self.common, **self.rest, "_computed": asked}
-        if not self.own_reference:
-            fields["_reference"] = self.reference
-        return fields
-
-    def _state_at(self, lin: LinearModel) -> Array:
+    def state_at(self, lin: LinearModel) -> Array:
+        """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
         chart, r_b = _STANDING, _STANDING.q_b
         if not self.own_reference:
@@ -273,7 +261,14 @@ class Linearizer:
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
+        self._rate = "_drift" if ready.moving else "f0"
+        # Fields of a model at rest except B and q; slow ones are computed at their first use.
+        slow = {"x0": ready.state_at, "y0": ready.state_at}
+        self._fields = {**ready.common, **ready.rest, "_computed": slow}
+        if ready.own_reference:
+            slow["_reference"] = partial(own_reference, robot)
+        else:
+            self._fields["_reference"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Without springs, gravity, orbit and stored momentum, all of a model at rest except M^-1

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Result, frozen, number, positive
+from fflin.base.validation import Array, Result, Vector, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
@@ -68,10 +68,10 @@ class StateSpace(Result):
     B: Array
     C: Array
     D: Array
-    f0: Array
-    x0: Array
-    u0: Array
-    y0: Array
+    f0: Vector
+    x0: Vector
+    u0: Vector
+    y0: Vector
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -335,19 +335,13 @@ class LinearModel(StateSpace):
         """
         self.require_unchanged()
         dt = positive("dt", dt, "s")
-        if self.dt:
-            raise InputError(
-                f"the model is already sampled, at dt = {self.dt:g} s; discretize the "
-                "continuous-time model"
-            )
+        refuse_sampled(self.dt, "discretize")
         Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(
                 f"dt is {dt:g} s, over which the model's response overflows; give a smaller dt"
             )
-        sampled = replace(
-            self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
-        )
+        sampled = replace(self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt)
         return replace(sampled, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
@@ -395,7 +389,8 @@ class LinearModel(StateSpace):
         ----------
         path : str or Path
             Path that ends in .npz, .mat, .json or .csv. For .csv, each matrix is written to a
-            separate file, such as NAME.A.csv.
+            separate file, such as NAME.A.csv; these tables are for other programs, and `load` does
+            not read them.
 
         Raises
         ------
@@ -411,7 +406,7 @@ class LinearModel(StateSpace):
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
-        """Read a model that `save` wrote, and restore every value bit for bit.
+        """Read a .npz, .mat or .json file that `save` wrote, and restore every value bit for bit.
 
         Raises
         ------
@@ -436,5 +431,10 @@ def state_space(
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 
-def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
-    return continuous.M
+def refuse_sampled(dt: float, do: str) -> None:
+    """Raise `InputError` if a model has a sampling time; `do` is what the caller does with it."""
+    if dt:
+        raise InputError(
+            f"the model is already sampled, at dt = {dt:g} s; {do} the continuous-time model "
+            "instead"
+        )

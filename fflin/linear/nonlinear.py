@@ -63,10 +63,7 @@ class Nonlinear:
 
     def rates(self, point: Array) -> Array:
         """Return dx/dt (N, nx) of rows (x, u) (N, nx + nu)."""
-        return self._rates(point[:, : self.state.nx], *self.accelerations(point))
-
-    def _rates(self, x: Array, chart: Chart, q: Array, v: Array, a: Array) -> Array:
-        state = self.state
+        state, (chart, _, v, a) = self.state, self.accelerations(point)
         # edot = (e0 (w - w*) + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r, with v* and w* of
         # the reference.
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
@@ -74,7 +71,7 @@ class Nonlinear:
         turning = chart.q0 * (angular - at_angular)
         turning += times(skew(chart.q_b), angular + at_angular)
         position_rate = times(chart.R, linear) - at_linear
-        position_rate -= times(skew(at_angular), x[:, state.groups.r_b])
+        position_rate -= times(skew(at_angular), point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
             # Add the term by which the derivative of the components in reference axes differs.
@@ -92,8 +89,8 @@ class Nonlinear:
         x = np.tile(lin.x0, (7, 1))
         x[:, state.groups.r_b] = 0.0
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
-        chart, q, v, a = near.accelerations(np.hstack((x, np.tile(lin.u0, (7, 1)))))
-        expected = near._rates(x, chart, q, v, a)
+        point = np.hstack((x, np.tile(lin.u0, (7, 1))))
+        (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
         # Differences at t = -3 h ... 3 h.
         h = 1e-2 * chart.q0 / (1.0 + np.abs(v[:, 3:]).max(axis=1, keepdims=True))
         t = np.concatenate((h, 2.0 * h, 3.0 * h, -h, -2.0 * h, -3.0 * h))

@@ -101,9 +101,7 @@ class ToolCoordinates:
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
             self._inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
-        self.inputs: dict[str, str] = {}
-        for i in self._inputs:
-            self.inputs[acting.names[i]] = acting.units[i]
+        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
@@ -125,9 +123,8 @@ class ToolCoordinates:
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
         attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
         pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
-        twist = (
-            self._rotated(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
-        )
+        turned = self._rotated(R, rates=self.convention.rates)
+        twist = turned @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
         parts = (pose, joints), (twist, v[self._idx_v] / self._scales)
         q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
@@ -231,9 +228,8 @@ class ToolCoordinates:
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
         wrench, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
         V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
-        H[:, :3] = (
-            wrench.T @ X.T @ self._held(np.linalg.solve(X.T, wrench @ u)) @ X[ANGULAR, ANGULAR]
-        )
+        held = self._held(np.linalg.solve(X.T, wrench @ u))
+        H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
         return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +17,7 @@ from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, as_double, frozen, instance, number, vector
+from fflin.base.validation import as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
@@ -29,6 +29,7 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin import Motion
+    from fflin.base.validation import Array, Indices, Vector
 
 # Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
@@ -105,10 +106,8 @@ class Trajectory(Design):
     ((11, 13), 'previous', True)
     """
 
-    VECTORS: ClassVar = ("t",)
-
     robot: Robot
-    t: Array
+    t: Vector
     q: Array
     v: Array
     u: Array
@@ -131,11 +130,8 @@ class Trajectory(Design):
             )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
-        q, v, u = (
-            _configurations(robot, self.q, count),
-            as_double("v", self.v),
-            as_double("u", self.u),
-        )
+        q = _configurations(robot, self.q, count)
+        v, u = as_double("v", self.v), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
         u = np.vstack((u, u[-1:])) if short else u
@@ -147,10 +143,8 @@ class Trajectory(Design):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
-        values["hold"] = self.hold or ("previous" if short else "linear")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        hold = self.hold or ("previous" if short else "linear")
+        vars(self).update(t=times, q=frozen(q), v=frozen(v), u=frozen(u), hold=hold)
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -231,16 +225,7 @@ class Trajectory(Design):
             times = np.append(times, self.t[-1])
         q, v, _ = self.points(times)
         k, s = intervals_of(self.t, times)
-        return Trajectory(
-            self.robot,
-            times,
-            q,
-            v,
-            self._input(k, s[:, None]),
-            hold=self.hold,
-            frame=self.frame,
-            verified=self.verified,
-        )
+        return Trajectory._of(self, t=times, q=q, v=v, u=self._input(k, s[:, None]), _note="")
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""

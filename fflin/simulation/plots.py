@@ -1,4 +1,4 @@
-"""Figure of a motion with matplotlib: states, inputs, errors and drifts."""
+"""Charts of a motion, and its figure: states, inputs, errors and drifts."""
 
 from __future__ import annotations
 
@@ -14,119 +14,157 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
-from fflin.simulation.report import Curve, curves
+from fflin.simulation.motion import Motion, require_motion
+from fflin.simulation.report import STATES, Curve, curves
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
-    from fflin.simulation.motion import Motion
 
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
-# Titles of panels by the group of their curves: states, and wheels.
-_STATES = {
-    "q_b": "attitude q_b",
-    "r_b": "position r_b",
-    "q_m": "joints q_m",
-    "omega_b": "angular velocity omega_b",
-    "v_b": "velocity v_b",
-    "qdot_m": "joint rates qdot_m",
+# Titles of charts by the group and the unit of their curves, in the order of the charts.
+_TITLES = {
+    ("q_b", "1"): "attitude",
+    ("r_b", "m"): "position",
+    ("q_m", "rad"): "joints",
+    ("q_m", "m"): "prismatic joints",
+    ("q_m", "kg^0.5 m"): "modal amplitudes",
+    ("omega_b", "rad/s"): "angular velocity",
+    ("v_b", "m/s"): "velocity",
+    ("qdot_m", "rad/s"): "joint rates",
+    ("qdot_m", "m/s"): "prismatic joint rates",
+    ("qdot_m", "kg^0.5 m/s"): "modal rates",
+    ("tau_b", "N m"): "base torque",
+    ("F_b", "N"): "base force",
+    ("tau_m", "N m"): "joint torques",
+    ("tau_m", "N"): "joint forces",
+    ("thrust", "N"): "thrusters",
+    ("speed", "rad/s"): "wheel speed",
+    ("wheel", "N m"): "wheel torque",
+    ("momentum", "N m s"): "wheel momentum",
 }
-_WHEELS = {"speed": "wheel speeds", "wheel": "wheel torques", "momentum": "wheel momenta"}
+JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
 # A target that moves less than this between rows, in SI units, is at rest.
 _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target is at rest, or None."""
+    """Return the time [s] from which a moving target is at rest, or None; None with phases."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
-    if not len(moved) or moved[-1] + 2 >= len(places):
+    if motion.phases or not len(moved) or moved[-1] + 2 >= len(places):
         return None
     return float(motion.t[moved[-1] + 1])
 
 
-def draw_motion(motion: Motion, path: str | Path | None, show: Sequence[str] | None) -> Figure:
-    """Draw a motion; see `plot_motion`."""
-    panels, (what, errors) = _panels(motion, show), _errors(motion)
-    states = [title for title in panels if title in _STATES.values()]
-    others = len(panels) - len(states) + 1  # including the drift
+def plot_motion(
+    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
+) -> Figure:
+    """Draw the errors, inputs and momentum drift of a motion, with the linear prediction.
+
+    Parameters
+    ----------
+    motion : Motion
+        Motion to draw. If the motion has a prediction, solid lines show the nonlinear robot,
+        dashed lines show the linear model, and the panel below each group of states shows the
+        difference. If the robot follows a trajectory, pale lines show the reference, the panel
+        below each group shows the error, and a dotted line marks the time at which the reference
+        comes to rest.
+    path : str or Path, optional
+        File to which the figure is saved: .png, .pdf or .svg.
+    show : sequence of str, optional
+        States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
+        ``*.hinge_*``. By default, all states and inputs are drawn.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If `path` has another ending or the file cannot be written.
+    UnknownNameError
+        If a name in `show` matches no state or input.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
+    """
+    what, errors = _errors(require_motion(motion))
+    drawn = charts(motion, show)
+    states = [title for title, found in drawn.items() if found[0].group in STATES]
+    others = len(drawn) - len(states) + 1  # including the drift
     per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
     heights += [3.0] * math.ceil(others / _ACROSS)
-    joints: dict[str, Line2D] = {}
-    large: dict[str, dict[str, Line2D]] = {}
+    spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
+    spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
+    # A joint has the same colour in all charts.
+    every = [curve for found in drawn.values() for curve in found]
+    joints = dict.fromkeys(curve.short for curve in every if curve.group in JOINTS)
+    legends: dict[str, dict[str, Artist]] = {}
     with drawing(path, 11.0, 0.3 + sum(heights)) as figure:
+        colors = dict(zip(joints, cycle(len(joints)), strict=True))
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
-        spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
-        spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
-        for (row, column), (title, found) in zip(spots, panels.items(), strict=False):
-            axes = figure.add_subplot(grid[row, column])
-            _draw(axes, motion.t, found, title, {x: y.get_color() for x, y in joints.items()})
+        for (row, column), (title, found) in zip(spots, drawn.items(), strict=False):
+            axes, group = figure.add_subplot(grid[row, column]), found[0].group
+            axes.set_title(f"{title} {group}" if title in states else title)
+            _draw(axes, motion.t, found, colors if group in JOINTS else {})
             if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
-            lines = {str(x.get_label()): x for x in axes.get_lines()}
-            named = {label: line for label, line in lines.items() if label[0] != "_"}
-            if title.startswith("joint"):
-                # One legend below names the joints of all panels, because their names are long.
-                joints |= named if title in states or not joints else {}
-                joints |= {"limit": named["limit"]} if "limit" in named else {}
-            elif len(found) > _MOST_IN_A_PANEL:
-                large[title] = named
+            if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
+                # One legend below names the joints of all charts, because their names are long.
+                named = legends.setdefault("joints" if group in JOINTS else title, {})
+                named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
             else:
                 if many := len(found) > 3:
                     axes.margins(y=0.3)  # room for the names above the curves
                 axes.legend(ncols=2 if many else 1, handlelength=1.4)
             if errors and title in states:
                 strip = figure.add_subplot(grid[row + 1, column], sharex=axes)
-                _draw(strip, motion.t, [errors[curve.key] for curve in found], width=1.0)
+                below = [errors[curve.key] for curve in found]
+                _draw(strip, motion.t, below, colors if group in JOINTS else {}, width=1.0)
                 strip.set_ylabel(f"{what}\n{strip.get_ylabel()}".strip())
                 strip.ticklabel_format(axis="y", scilimits=(-2, 3))
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
-        for title, named in large.items():
-            _below(figure, named, title, "right" if joints else "center")
-        if joints:
-            limit = {"limit": joints.pop("limit")} if "limit" in joints else {}
-            _below(figure, joints | limit, "joints", "left" if large else "center")
-        rest = None if motion.phases else resting_from(motion)
-        phases = list(zip(motion.phases[1:], motion.starts[1:].tolist(), strict=True))
-        marks = [*(start for _, start in phases), *([] if rest is None else [rest])]
-        for axes, mark in product(figure.axes, marks):
+        _name_below(figure, legends)
+        starts, rest = motion.starts[1:].tolist(), resting_from(motion)
+        for axes, mark in product(figure.axes, starts if rest is None else [rest]):
             axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
         _draw_drifts(figure.add_subplot(grid[spots[-1]]), motion)
         for axes in figure.axes:
             axes.margins(x=0.0)
         head = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
         head += ["solid: nonlinear, dashed: linear"] * (motion.linear is not None)
+        phases = zip(motion.phases[1:], starts, strict=True)
         head += [f"{name} at {start:g} s" for name, start in phases]
         figure.suptitle(f"{'; '.join(head)}\n{motion.stopped}".strip(), fontsize=11)
     return figure
 
 
-def _panels(motion: Motion, show: Sequence[str] | None) -> dict[str, list[Curve]]:
-    """Return the chosen curves of each panel by its title; panels of wheels come last."""
+def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
+    """Return the chosen curves of each chart by its title; the curves of a chart have one unit."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
         raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
     keys = names if show is None else [names[i] for i in chosen("state or input", show, names)]
-    panels: dict[str, list[Curve]] = {}
+    found: dict[str, list[Curve]] = {title: [] for title in _TITLES.values()}
     for curve in curves(motion):
-        torque = curve.unit == "N m"
-        title = "torques" if torque else "forces"
-        if curve.group == "tau_m":  # most robots have only revolute or only prismatic joints
-            title = "joint inputs tau_m" if torque else "joint forces tau_m"
-        elif curve.group != "wheel" or curve.short in motion.wheels:
-            title = (_STATES | _WHEELS).get(curve.group, title)
         if curve.key in keys:
-            panels.setdefault(title, []).append(curve)
-    for title in _WHEELS.values():
-        panels |= {title: panels.pop(title)} if title in panels else {}
-    return panels
+            title = _TITLES.get((curve.group, curve.unit), f"{curve.group} in {curve.unit}")
+            found.setdefault(title, []).append(curve)
+    return {title: each for title, each in found.items() if each}
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
@@ -148,30 +186,26 @@ def _draw(
     axes: Axes,
     t: Array,
     found: Sequence[Curve],
-    title: str = "",
-    colors: Mapping[str, Any] | None = None,
+    colors: Mapping[str, str],
     width: float | None = None,
 ) -> None:
     """Draw curves, their references (pale), predictions (dashed) and limits."""
-    group = found[0].group
+    group, unit = found[0].group, found[0].unit
     if group == "q_b":
         found = _with_gaps(found)
-    inputs = title and group not in _STATES and title not in _WHEELS.values()
-    steps = "steps-post" if inputs or group == "wheel" else "default"
+    steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
     for own, curve in zip(cycle(len(found)), found, strict=True):
-        color = (colors or {}).get(curve.short, own)
-        label = curve.name if inputs else curve.short
+        color = colors.get(curve.short, own)
         if curve.reference is not None:
             axes.plot(t, curve.reference, color=color, lw=3.6, alpha=0.3)
-        axes.plot(t, curve.values, color=color, label=label, drawstyle=steps, lw=width)
+        axes.plot(t, curve.values, color=color, label=curve.short, drawstyle=steps, lw=width)
         if curve.linear is not None:
             axes.plot(t, curve.linear, color=color, ls="--", lw=1.0)
     levels = sorted({level for curve in found for level in curve.near})
     for level in levels:
         label = "limit" if level == levels[-1] else "_limit"
         axes.axhline(level, ls="--", lw=0.9, color="#555555", label=label)
-    units = ", ".join(sorted({curve.unit for curve in found} - {"1"}))
-    axes.set(title=title, xlabel="t [s]", ylabel=units and f"[{units}]")
+    axes.set(xlabel="t [s]", ylabel="" if unit == "1" else f"[{unit}]")
 
 
 def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
@@ -185,13 +219,16 @@ def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
     return broken
 
 
-def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -> None:
-    """Add a legend below all panels, with as many columns as fit."""
-    letters = 150 if side == "center" else 75
-    columns = min(len(lines), 8, max(1, letters // (max(map(len, lines)) + 6)))
-    place: Any = f"outside lower {side}"
-    named = list(lines.values())
-    figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
+def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> None:
+    """Add legends below all charts, with as many columns as fit."""
+    for title, named in legends.items():
+        side = "center" if len(legends) == 1 else "left" if title == "joints" else "right"
+        letters = 150 if side == "center" else 75
+        columns = min(len(named), 8, max(1, letters // (max(map(len, named)) + 6)))
+        names = sorted(named, key="limit".__eq__)  # the limit last
+        lines = [named[name] for name in names]
+        place: Any = f"outside lower {side}"
+        figure.legend(lines, names, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
 def _draw_drifts(axes: Axes, motion: Motion) -> None:

@@ -37,7 +37,7 @@ _OF_PHASES = (
     "before: total of all bodies in the impact"
 )
 
-_STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 _TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
 # Errors of flexible appendages and liquids, which do not count as settling.
@@ -68,7 +68,7 @@ class Curve(NamedTuple):
     @property
     def short(self) -> str:
         """Name without its group."""
-        return self.name.partition(".")[2] or self.name
+        return self.key.partition(".")[2]
 
     @property
     def levels(self) -> list[float]:
@@ -155,7 +155,7 @@ def saturated(t: Array, found: Iterable[Curve]) -> tuple[Saturated, ...]:
     for curve in found:
         # A wheel speed only approaches its limit, but an input is clipped exactly at its limit.
         margin = 1e-3 if curve.group == "speed" else 1e-9
-        enforced = curve.group not in (*_STATES, "momentum")
+        enforced = curve.group not in (*STATES, "momentum")
         for limit in curve.levels if enforced else ():
             spent = held[np.abs(curve.values - limit) <= margin * abs(limit)]
             if limit and spent.any():

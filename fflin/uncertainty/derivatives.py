@@ -74,15 +74,10 @@ class ModelDerivatives:
         self._state, self._data = state, robot.create_data()
         self._chart = Standing() if own else state.chart(lin.q)
         self._u, self._nu = actuation.in_base_axes(self._chart, lin.u0), state.velocities(lin.v)
-        self._inverse = np.empty((len(self._nu), len(self._nu)))
-        self._rates = Accelerations(state, actuation, data).rates(
-            lin.q,
-            lin.v,
-            self._nu,
-            self._u,
-            slopes=np.empty((len(self._nu), state.nx)),
-            by_u=np.empty((len(self._nu), len(self._u))),
-        )
+        nv, nu = len(self._nu), len(self._u)
+        self._inverse, slopes, by_u = (np.empty((nv, size)) for size in (nv, state.nx, nu))
+        accelerations = Accelerations(state, actuation, data)
+        self._rates = accelerations.rates(lin.q, lin.v, self._nu, self._u, slopes, by_u)
         Inertia(state, data).invert(lin.q, self._inverse)
         # The accelerations do not depend on position and velocity of the base; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
@@ -98,23 +93,15 @@ class ModelDerivatives:
         rates = self._rates_over(parameters)
         # A, B and f0 are affine in the rates. The additional last row has zero rates, so it gives
         # the constant part, which is subtracted below.
-        state, count, nv = self._state, len(rates.c) + 1, len(self._nu)
+        state, ready, count, nv = self._state, self._ready, len(rates.c) + 1, len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         with_none = AccelerationDerivatives(
             np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3))
         )
         for part, of_parameters in zip(with_none, rates, strict=True):
             part[:-1] = of_parameters
-        f0 = assemble(
-            state,
-            self._ready.actuation,
-            self._chart,
-            nu=np.broadcast_to(self._nu, (count, nv)),
-            u=np.broadcast_to(self._u, (count, len(self._u))),
-            rates=with_none,
-            A=A,
-            moving=self._ready.moving,
-        )
+        nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
+        f0 = assemble(state, ready.actuation, self._chart, nu, u, with_none, A, moving=ready.moving)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
@@ -294,14 +281,11 @@ class ModelDerivatives:
         B = np.zeros_like(self._rates.by_u)
         F_q: Array = np.zeros((size, size - 6))
         F_nu = np.zeros((size, size))
-        if one.spring >= 0:
-            moved = state.joint_positions(self._q) - self.robot.springs.rest
-            F_q[6 + one.spring, one.spring] = one.by_stiffness
-            F[6 + one.spring] = one.by_stiffness * moved[one.spring]
-        if one.damper >= 0:
-            at = 6 + one.damper
-            F_nu[at, at] = one.by_damping
-            F[at] += one.by_damping * state.velocities(self._v)[at]
+        if (joint := one.joint) >= 0:
+            at = 6 + joint
+            moved = state.joint_positions(self._q)[joint] - self.robot.springs.rest[joint]
+            F[at] = one.by_stiffness * moved + one.by_damping * state.velocities(self._v)[at]
+            F_q[at, joint], F_nu[at, at] = one.by_stiffness, one.by_damping
         if one.wrench:
             joint, column, wrench = one.wrench
             B[:, column] = self._jacobians()[joint - ROOT].T @ wrench

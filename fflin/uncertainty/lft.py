@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -28,7 +28,7 @@ from fflin.base.names import matching
 from fflin.base.record import Design
 from fflin.base.rotation import skew
 from fflin.base.tables import counted, cut, folded, grid
-from fflin.base.validation import Array, as_double, numbers
+from fflin.base.validation import Array, Vector, as_double, numbers
 from fflin.linear.linearization import Prepared
 from fflin.linear.model import LinearModel, state_space
 from fflin.robot.mass_properties import Piece
@@ -84,8 +84,6 @@ class LFT(Design):
     (('base.density',), (18, 9))
     """
 
-    VECTORS: ClassVar = ("repeats", "middle", "half")
-
     A: Array
     B1: Array
     B2: Array
@@ -97,9 +95,9 @@ class LFT(Design):
     D22: Array
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    repeats: Array
-    middle: Array
-    half: Array
+    repeats: Vector
+    middle: Vector
+    half: Vector
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
@@ -209,19 +207,6 @@ class Range(NamedTuple):
     middle: float
     half: float
 
-    @property
-    def shift(self) -> float:
-        """Difference between the middle and the nominal value."""
-        return self.middle - self.parameter.value
-
-    @property
-    def repeats(self) -> int:
-        """Number of signals that the parameter multiplies."""
-        part = self.parameter.part
-        if part[:8] == "inertia." and part[8] == part[9]:
-            return 1
-        return _REPEATS.get(part.partition(".")[0], 1)
-
 
 class Block(NamedTuple):
     """Block of an uncertain model: one delta, which varies a parameter or several tied ones.
@@ -235,20 +220,14 @@ class Block(NamedTuple):
     half: float
     ranges: tuple[Range, ...]
 
-    @property
-    def repeats(self) -> int:
-        """Number of signals that the block's delta multiplies."""
-        return sum(each.repeats for each in self.ranges)
-
     def values(self, value: float) -> dict[str, float]:
         """Return {parameter: value} for a common value or factor of the block."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
-# Number of signals for each part. "inertia" is an off-diagonal entry, or a wheel's inertia, which
-# is also subtracted from the wheel's carrier. "frequency" is squared.
-_REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2, "frequency": 2}
+# Largest number of signals that a parameter multiplies (those of a density).
+_MOST = 6
 
 
 def linear_fractional(
@@ -264,7 +243,7 @@ def linear_fractional(
         one = each.parameter
         if one.of in pieces and one.part in OF_PIECES:
             of_pieces.setdefault(one.of, {})[one.part] = at
-        elif one.of in modes and one.damper >= 0:
+        elif one.of in modes and one.joint >= 0:
             of_modes.setdefault(one.of, {})[one.part] = at
         else:
             form.add_alone(at)
@@ -272,12 +251,17 @@ def linear_fractional(
         form.add_piece(pieces[name], parts)
     for name, parts in of_modes.items():
         form.add_mode(robot.joint_names.index(name), parts)
+    taken = (np.arange(_MOST) < form.used[:, None]).ravel()
+    ends = np.cumsum([len(block.ranges) for block in blocks])[:-1]
+    repeats = [float(each.sum()) for each in np.split(form.used, ends)]
     # Solve the equation of motion for a, and eliminate a from z.
-    (M, *others), (Z, *direct) = form.parts(form.force), form.parts(form.z)
+    (M, *others), (Z, *direct) = form.parts(form.force), form.parts(form.z[taken])
+    others[2], direct[2] = others[2][:, taken], direct[2][:, taken]
     x, u, w = (-np.linalg.solve(M, each) for each in others)
     C1, D12, D11 = (d + Z @ each for d, each in zip(direct, (x, u, w), strict=True))
     nv, ny, nw = len(x), len(lin.C), len(D11)
-    return LFT(
+    return LFT._of(
+        lin,
         A=np.vstack((lin.A[:nv], x)),
         B1=np.vstack((np.zeros((nv, nw)), w)),
         B2=np.vstack((np.zeros_like(u), u)),
@@ -289,13 +273,9 @@ def linear_fractional(
         D22=np.array(lin.D),
         parameters=tuple(each.name for each in blocks),
         units=tuple(each.unit for each in blocks),
-        repeats=np.array([float(each.repeats) for each in blocks]),
+        repeats=np.array(repeats),
         middle=np.array([each.middle for each in blocks]),
         half=np.array([each.half for each in blocks]),
-        state_names=lin.state_names,
-        input_names=lin.input_names,
-        output_names=lin.output_names,
-        robot=lin.robot,
     )
 
 
@@ -318,12 +298,12 @@ class _Form:
             J = state.columns(pin.getJointJacobian(robot.model, data, joint, _LOCAL))
             M += J.T @ robot.model.inertias[joint].matrix() @ J
             self.jacobians[joint] = J
-        repeats = [each.repeats for each in ranges]
-        self.ends = np.cumsum((len(M), state.nx, columns.shape[1], sum(repeats)))
+        self.ends = np.cumsum((len(M), state.nx, columns.shape[1], _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
-        self.next = list(np.cumsum((0, *repeats[:-1])))
-        self.z = np.zeros((sum(repeats), self.ends[-1]))
+        # Every parameter has places for _MOST signals, of which it takes as many as it needs.
+        self.used = np.zeros(len(ranges), dtype=np.intp)
+        self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
         # Inertial and spring forces minus input forces. The equation of motion sets this sum to
         # zero.
         self.force = np.zeros((len(M), self.ends[-1]))
@@ -339,12 +319,14 @@ class _Form:
     def times(self, at: int, signals: Array) -> Array:
         """Return a parameter's change times signals: (shift + half * delta) * signals.
 
-        The product delta * half * signals is a new w, and `half` times the signals is added to z.
+        The shift is the difference between the middle of the range and the nominal value. The
+        product delta * half * signals is a new w, and `half` times the signals is added to z.
         """
-        one, first = self.ranges[at], self.next[at]
-        self.next[at] += len(signals)
-        self.z[first : self.next[at]] = one.half * signals
-        return one.shift * signals + self.unit[self.ends[2] + first : self.ends[2] + self.next[at]]
+        (one, middle, half), first = self.ranges[at], _MOST * at + self.used[at]
+        rows = slice(first, first + len(signals))
+        self.used[at] += len(signals)
+        self.z[rows] = half * signals
+        return (middle - one.value) * signals + self.unit[self.ends[2] :][rows]
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
         """Replace the nominal inertial force of a link by the force with uncertain parameters."""
@@ -380,11 +362,10 @@ class _Form:
     def add_alone(self, at: int) -> None:
         """Add the effect of a parameter of a joint, a thruster or a wheel."""
         one = self.ranges[at].parameter
-        if one.spring >= 0:
-            self.force[6 + one.spring] += self.times(at, self.x[[6 + one.spring]])[0]
-        elif one.damper >= 0:
-            row = self.state.groups.qdot_m.start + one.damper
-            self.force[6 + one.damper] += self.times(at, self.x[[row]])[0]
+        if one.joint >= 0:
+            rate = self.x[[self.state.groups.qdot_m.start + one.joint]]
+            signal = one.by_stiffness * self.x[[6 + one.joint]] + one.by_damping * rate
+            self.force[6 + one.joint] += self.times(at, signal)[0]
         elif one.wrench:
             joint, column, wrench = one.wrench
             given = self.jacobians[joint].T @ wrench
@@ -395,7 +376,8 @@ class _Form:
                 for joint, parameters in one.bodies.items()
             )
             values, vectors = np.linalg.eigh(change)
-            most = np.argsort(-np.abs(values))[: self.ranges[at].repeats]
+            # The inertia of a wheel is also subtracted from its carrier, so the rank is 2.
+            most = np.argsort(-np.abs(values))[:2]
             L = vectors[:, most]
             self.force += L @ self.times(at, (values[most, None] * L.T) @ self.a)
 

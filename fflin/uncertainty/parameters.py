@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.names import matching, stands_for_any
 from fflin.base.rotation import skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, positive
 from fflin.robot.equipment.mounting import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
@@ -43,10 +43,9 @@ class Parameter:
     # {Pinocchio joint: change (10,) of its body}: m, m c, and xx, xy, yy, xz, yz, zz of I about
     # the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    spring: int = -1  # joint whose stiffness changes, in state order; -1 for none
-    damper: int = -1  # joint whose damping changes, in state order; -1 for none
-    by_stiffness: float = 1.0  # change of the stiffness per unit
-    by_damping: float = 1.0  # change of the damping per unit
+    joint: int = -1  # joint whose spring or damper changes, in state order; -1 for none
+    by_stiffness: float = 0.0  # change of the joint's stiffness per unit
+    by_damping: float = 0.0  # change of the joint's damping per unit
     # (Pinocchio joint, index of the input, change (6,) of its unit wrench in the joint's frame)
     wrench: tuple[int, int, Array] | None = None
 
@@ -96,8 +95,7 @@ class Parameters(dict[str, Parameter]):
         """Return the robot with {parameter: value}, or raise `InputError` if it is impossible."""
         nominal, bodies, parts = self._robot, self._bodies(values), self._by_owner(values)
         robot = nominal.with_bodies(bodies) if bodies else nominal
-        fields: dict[str, object] = {}
-        springs: dict[str, dict[str, float]] = {"stiffness": {}, "damping": {}}
+        springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
             own, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
             if own and joint.mode and stiffness:
@@ -107,21 +105,18 @@ class Parameters(dict[str, Parameter]):
                 own = {"stiffness": joint.inertia * omega**2, "damping": damping}
             for part in springs.keys() & own.keys():
                 springs[part][joint.name] = own[part]
-        for part, given in springs.items():
-            if given:
-                fields[part] = {**getattr(robot, part), **given}
         inputs = list(robot.inputs)
         for index, (item, names) in enumerate(named_inputs(robot.inputs)):
             own = parts.get(names[0], {})
             if isinstance(item, ReactionWheel) and "inertia" in own:
                 inputs[index] = replace(item, inertia=own["inertia"])
-                fields["inputs"] = inputs
             if isinstance(item, Thruster) and own:
                 old = zip(AXES, item.position, strict=True)
                 position = [own.get(f"position.{axis}", x) for axis, x in old]
                 inputs[index] = replace(item, position=position)
-                fields["inputs"] = inputs
-        return robot.replace(**fields) if fields else robot
+        fields = {**springs, "inputs": tuple(inputs)}
+        changed = {key: value for key, value in fields.items() if value != getattr(robot, key)}
+        return robot.replace(**changed) if changed else robot
 
     def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return {owner: {part: value}} from {parameter: value}."""
@@ -142,13 +137,8 @@ class Parameters(dict[str, Parameter]):
             com = [parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)]
             for entry, (i, j) in ENTRIES.items():
                 inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
-            mass, density = parts.get("mass", piece.mass), parts.get("density", 1.0)
-            if not density > 0.0:
-                raise InputError(
-                    f"the density of '{name}' has the factor {density:.4g}, expected above 0"
-                )
-            if not mass > 0.0:
-                raise InputError(f"the mass of '{name}' is {mass:.4g} kg, expected above 0")
+            mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
+            density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
             # Inertias that are not changed are accepted, for example zero for a point mass. An
             # impossible inertia may be changed unless the change makes it worse.
             was, least = (
@@ -208,23 +198,17 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
         stiffness, damping, _ = (each[index].item() for each in robot.springs)
         if joint.mode and stiffness:
             omega, ratio = joint.oscillation(stiffness, damping)
-            yield Parameter(
-                name,
-                "frequency",
-                "Hz",
-                omega / _TURN,
-                spring=index,
-                damper=index,
-                by_stiffness=2.0 * inertia * omega * _TURN,
-                by_damping=2.0 * ratio * inertia * _TURN,
-            )
-            by_damping = 2.0 * inertia * omega
-            yield Parameter(name, "damping", "1", ratio, damper=index, by_damping=by_damping)
+            by_rate, per_turn = 2.0 * inertia * omega, 2.0 * inertia * _TURN
+            own = Parameter(name, "frequency", "Hz", omega / _TURN, joint=index)
+            yield replace(own, by_stiffness=by_rate * _TURN, by_damping=per_turn * ratio)
+            yield Parameter(name, "damping", "1", ratio, joint=index, by_damping=by_rate)
             continue
         per = f"/({joint.unit})" if " " in joint.unit else f"/{joint.unit}"
         force = joint.force_unit
-        yield Parameter(name, "stiffness", f"{force}{per}", stiffness, spring=index)
-        yield Parameter(name, "damping", f"{force} s{per}", damping, damper=index)
+        yield Parameter(
+            name, "stiffness", f"{force}{per}", stiffness, joint=index, by_stiffness=1.0
+        )
+        yield Parameter(name, "damping", f"{force} s{per}", damping, joint=index, by_damping=1.0)
 
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
@@ -240,15 +224,13 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))
-                for part, unit, value, wrench in (
-                    ("position", "m", where @ d, moved),
-                    ("direction", "1", along @ d, tilted),
+                for part, unit, at_joint, wrench in (
+                    ("position", "m", where, moved),
+                    ("direction", "1", along, tilted),
                 ):
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
-                    at_input = (joint, first, in_joint)
-                    yield Parameter(
-                        names[0], f"{part}.{letter}", unit, float(value), wrench=at_input
-                    )
+                    made = Parameter(names[0], f"{part}.{letter}", unit, float(at_joint @ d))
+                    yield replace(made, wrench=(joint, first, in_joint))
         if isinstance(item, ReactionWheel) and item.inertia:
             joint, axis = carrier(robot.model, item)
             own = robot.model.getJointId(names[0])

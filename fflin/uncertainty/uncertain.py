@@ -84,7 +84,8 @@ class Uncertain:
                 "remove it with robot.replace(outputs=)"
             )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
-        pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
+        varied = [each.parameter for each in self.ranges if each.parameter.by_stiffness]
+        pulled = [rest[one.joint] for one in varied]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
             raise InputError(
@@ -272,13 +273,13 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     parameters, alone, together = Parameters(robot), dict[str, Block](), list[Block]()
     for key, value in given.items():
         own, tied = untied(key, value)
-        ones = [parameters[name] for name in parameters.find(key)]
+        found = [_range(parameters[name], own) for name in parameters.find(key)]
         if tied:
-            together.append(_tied(key, ones, own))
-        else:
-            for one in ones:
-                _, middle, half = each = _range(one, own)
-                alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
+            together.append(_tied(key, found, own))
+            continue
+        for each in found:
+            one, middle, half = each
+            alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
     made = Uncertain(robot, (*alone.values(), *together), parameters)
     names = [each.parameter.name for each in made.ranges]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -329,10 +330,9 @@ def _range(one: Parameter, value: object) -> Range:
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
 
-def _tied(key: str, parameters: list[Parameter], value: object) -> Block:
+def _tied(key: str, ranges: list[Range], value: object) -> Block:
     """Return the block of tied parameters, which have a common delta."""
-    ranges = [_range(one, value) for one in parameters]
-    units = {one.unit for one in parameters}
+    units = {each.parameter.unit for each in ranges}
     if isinstance(value, tuple | list):
         if len(units) > 1:
             raise InputError(

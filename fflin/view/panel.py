@@ -8,10 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.simulation.plots import resting_from
-from fflin.simulation.report import Curve, curves
+from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
+from fflin.simulation.report import STATES, Curve
 from fflin.view.page import packed
 
 if TYPE_CHECKING:
@@ -25,53 +24,25 @@ _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
 
-# {(group, unit): title of the plot}. A name has the same colour in all plots of one dictionary.
-_CHARTS: tuple[dict[tuple[str, str], str], ...] = (
-    {("tau_b", "N m"): "base torque"},
-    {("F_b", "N"): "base force"},
-    {
-        ("q_m", "rad"): "joints",
-        ("q_m", "m"): "prismatic joints",
-        ("q_m", "kg^0.5 m"): "modal amplitudes",
-        ("qdot_m", "rad/s"): "joint rates",
-        ("qdot_m", "m/s"): "prismatic joint rates",
-        ("tau_m", "N m"): "joint torques",
-        ("tau_m", "N"): "joint forces",
-    },
-    {("thrust", "N"): "thrusters"},
-    {
-        ("speed", "rad/s"): "wheel speed",
-        ("wheel", "N m"): "wheel torque",
-        ("momentum", "N m s"): "wheel momentum",
-    },
-)
-
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
     """Return {quantity: (unit, errors (N,))} of q (N, nq) from the target.
 
     Wheels and modes are left out.
     """
-    state = StateMap(robot)
-    goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
-    relative = [
-        goal.actInv(pin.XYZQUATToSE3(each[:7])) for goal, each in zip(goals, q, strict=True)
-    ]
-    joints = state.joint_positions(q) - state.joint_positions(target)
-    for index, joint in enumerate(robot.joints):
-        if joint.unbounded:
-            joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
-    wheels = robot.wheels
-    turns = [not (j.prismatic or j.mode or j.name in wheels) for j in robot.joints]
-    slides = [j.prismatic and not j.mode for j in robot.joints]
+    goals = np.broadcast_to(target, q.shape)
+    apart = np.array([pin.difference(robot.model, *each) for each in zip(goals, q, strict=True)])
+    joints = [joint for joint in robot.joints if not (joint.mode or joint.name in robot.wheels)]
+    turning = [joint.idx_v for joint in joints if not joint.prismatic]
+    sliding = [joint.idx_v for joint in joints if joint.prismatic]
     found = {
-        "attitude": ("°", np.degrees([np.linalg.norm(pin.log3(x.rotation)) for x in relative])),
-        "position": ("m", np.array([np.linalg.norm(x.translation) for x in relative])),
+        "attitude": ("°", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
+        "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
-    if any(turns):
-        found["largest joint"] = ("°", np.degrees(np.abs(joints[:, turns]).max(axis=1)))
-    if any(slides):
-        found["largest prismatic joint"] = ("m", np.abs(joints[:, slides]).max(axis=1))
+    if turning:
+        found["largest joint"] = ("°", np.degrees(np.abs(apart[:, turning]).max(axis=1)))
+    if sliding:
+        found["largest prismatic joint"] = ("m", np.abs(apart[:, sliding]).max(axis=1))
     return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 
@@ -81,36 +52,32 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [
-        _plot(title, unit, [("", Curve("", "", "", unit, values, _NONE))])
+        _plot(title, [Curve("", "", "", unit, values, _NONE)])
         for title, unit, values in readouts[: 4 if len(target) > 1 else 2]
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # it may be missing in a file
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
-    # Curves that are not always zero, by group and unit.
-    lines: dict[tuple[str, str], list[Curve]] = {}
-    for each in curves(motion):
-        followed = each.reference if len(target) > 1 else None
-        reference = None if followed is None else followed[shown]
-        curve = each._replace(values=each.values[shown], reference=reference)
-        if _size(curve) >= _NOTHING:
-            lines.setdefault((curve.group, curve.unit), []).append(curve)
-    for family, charts in enumerate(_CHARTS):
-        for key, title in charts.items():
-            near = lines.get(key, [])
-            least = _UNSEEN * max(map(_size, near), default=0.0)
-            seen = [(each.key.partition(".")[2], each) for each in near if _size(each) > least]
-            # Plots of rates are shown only if a limit is near.
-            if any(each.near or not title.endswith("rates") for _, each in seen):
-                plots.append(_plot(title, key[1], seen, family))
+    for title, whole in charts(motion).items():
+        lines = []
+        for each in whole:
+            followed = each.reference if len(target) > 1 else None
+            reference = None if followed is None else followed[shown]
+            lines.append(each._replace(values=each.values[shown], reference=reference))
+        least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
+        seen = [each for each in lines if _size(each) >= least]
+        # States of the base have errors instead. Rates are shown only if a limit is near.
+        of_base = whole[0].group in STATES and whole[0].group not in JOINTS
+        if any(each.near or not title.endswith("rates") for each in seen) and not of_base:
+            plots.append(_plot(title, seen))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
             for label, unit, values in readouts
         ],
         "plots": plots,
-        "rest": resting_from(motion) if len(target) > 1 and not motion.phases else None,
+        "rest": resting_from(motion) if len(target) > 1 else None,
         "passed": [[str(each), each.time] for each in motion.passed],
     }
 
@@ -121,21 +88,21 @@ def _size(curve: Curve) -> float:
     return float(np.abs(rows).max())
 
 
-def _plot(
-    title: str, unit: str, lines: list[tuple[str, Curve]], family: int = -1
-) -> dict[str, object]:
-    """Return a plot of labelled curves, with each limit that a curve comes near."""
+def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
+    """Return a plot of curves, with each limit that a curve comes near."""
+    group = lines[0].group
     return {
         "title": title,
-        "unit": unit,
-        "family": family,
+        "unit": lines[0].unit,
+        # A name has the same colour in all plots of a family.
+        "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
         "lines": [
             {
-                "label": label,
+                "label": curve.short,
                 "values": packed(curve.values),
                 "reference": "" if curve.reference is None else packed(curve.reference),
                 "limits": curve.near,
             }
-            for label, curve in lines
+            for curve in lines
         ],
     }

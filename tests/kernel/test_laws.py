@@ -5,11 +5,10 @@ import pinocchio as pin
 import pytest
 
 from fflin.control.channel import Saturation, channel_of
-from fflin.kernel import channel as rules
+from fflin.kernel import loop as rules
 from fflin.kernel.allocation import LEAST, least_squares, solve
-from fflin.kernel.channel import Pulses, Wheels
 from fflin.kernel.forward import ActuatorFaults, apply_faults
-from fflin.kernel.loop import StopConditions, goes_on
+from fflin.kernel.loop import Pulses, StopConditions, Wheels, goes_on
 
 DT, SAMPLE = 0.1, 4
 

@@ -13,7 +13,8 @@ import fflin
 from tests.support.messages import any_wording
 from tests.support.robots import random_point
 
-FORMATS = (".npz", ".mat", ".json", ".csv")
+LOADED = (".npz", ".mat", ".json")
+FORMATS = (*LOADED, ".csv")
 KEYS = {
     *("A", "B", "C", "D", "f0", "x0", "u0", "state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units", "frame", "q", "v", "dt", "robot"),
@@ -27,7 +28,7 @@ def lin(request):
     return fflin.linearize(robot, *random_point(robot, np.random.default_rng(1)), frame="world")
 
 
-@pytest.mark.parametrize("ending", FORMATS)
+@pytest.mark.parametrize("ending", LOADED)
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_round_trip_is_exact(lin, ending, dt, tmp_path):
     saved = lin.discretize(dt) if dt else lin
@@ -71,11 +72,16 @@ def test_keys_are_the_settled_ones(lin, tmp_path):
 
 def test_csv_names_rows_and_columns(lin, tmp_path):
     lin.save(tmp_path / "m.csv")
-    with (tmp_path / "m.B.csv").open(newline="") as file:
-        head, *rows = csv.reader(file)
-    assert tuple(head[1:]) == lin.input_names
-    assert tuple(row[0] for row in rows) == lin.state_names
-    assert [list(map(float, row[1:])) for row in rows] == lin.B.tolist()
+    names = {"x": lin.state_names, "u": lin.input_names, "y": lin.output_names}
+    names["v"] = lin.state_names[-len(lin.M) :]
+    for key, (of_rows, of_columns) in zip("ABCDM", ("xx", "xu", "yx", "yu", "vv"), strict=True):
+        with (tmp_path / f"m.{key}.csv").open(newline="") as file:
+            head, *rows = csv.reader(file)
+        assert tuple(head[1:]) == names[of_columns]
+        assert tuple(row[0] for row in rows) == names[of_rows]
+        assert [list(map(float, row[1:])) for row in rows] == getattr(lin, key).tolist()
+    with pytest.raises(fflin.FileError, match=r"'\.csv'.*\.npz, \.mat, \.json"):
+        fflin.LinearModel.load(tmp_path / "m.csv")
     with (tmp_path / "m.inputs.csv").open(newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["name", "unit", "u0"]
@@ -117,12 +123,10 @@ def test_bad_paths_are_told(lin, tmp_path):
         fflin.LinearModel.load(tmp_path / "none.npz")
 
 
-@pytest.mark.parametrize("ending", FORMATS)
+@pytest.mark.parametrize("ending", LOADED)
 @pytest.mark.parametrize("content", [b"", b"rubbish", b"{}", b"PK\x03\x04broken"])
 def test_other_files_are_refused(ending, content, tmp_path):
     path = tmp_path / f"m{ending}"
-    for name in ("A", "B", "C", "D", "M", "states", "inputs", "outputs", "info"):
-        (tmp_path / f"m.{name}.csv").write_bytes(content)
     path.write_bytes(content)
     with pytest.raises(fflin.FileError, match="linear model"):
         fflin.LinearModel.load(path)

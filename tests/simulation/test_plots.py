@@ -52,11 +52,9 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
     assert axes["velocity v_b"].get_ylabel() == "[m/s]"
-    torque = lines(axes["torques"])["tau_b.z"]
+    torque = lines(axes["base torque"])["z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
-    assert set(lines(axes["joint inputs tau_m"])) == {
-        name for name in motion.input_names if name.startswith("tau_m")
-    }
+    assert set(lines(axes["joint torques"])) == set(fflin.load("planar_detumble").joint_names)
     assert "relative momentum drift" in axes
 
 
@@ -139,14 +137,14 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
     named = {legend.get_title().get_text(): legend for legend in figure.legends}
     shown = [text.get_text() for text in named["joints"].get_texts()]
     assert shown == list(robot.joint_names)
-    assert len(named["forces"].get_texts()) == 12
+    assert len(named["thrusters"].get_texts()) == 12
     for legend in named.values():
         colors = {line.get_color() for line in legend.get_lines()}
         assert len(colors) == len(legend.get_lines())
     axes = {each.get_title(): each for each in figure.axes}
     torques, angles = (
         {line.get_label().rpartition(".")[2]: line.get_color() for line in axes[title].get_lines()}
-        for title in ("joint inputs tau_m", "joints q_m")
+        for title in ("joint torques", "joints q_m")
     )
     assert torques == angles
     # Nothing lies on anything else.
@@ -184,7 +182,8 @@ def limited():
 @pytest.mark.parametrize(("target", "since"), [((0, 1, 2, 3, 3), 0.75), ((0, 1, 2, 3, 4), None)])
 def test_a_target_rests_from_where_two_rows_of_it_are_one(target, since):
     rows = np.outer(target, (1.0, 0.0))
-    motion = SimpleNamespace(t=np.linspace(0.0, 1.0, 5), x=rows, target=rows, tracked=True)
+    t = np.linspace(0.0, 1.0, 5)
+    motion = SimpleNamespace(t=t, x=rows, target=rows, tracked=True, phases=())
     assert resting_from(motion) == since
 
 
@@ -195,21 +194,22 @@ def panels(figure):
 def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
     found = panels(limited.plot())
     units = {title: axes.get_ylabel() for title, axes in found.items()}
-    assert units["torques"] == "[N m]"
-    assert units["forces"] == "[N]"
-    assert units["joint inputs tau_m"] == "[N m]"
-    assert units["wheel speeds"] == "[rad/s]"
-    assert units["wheel torques"] == "[N m]"
-    assert units["wheel momenta"] == "[N m s]"
-    assert {"tau_b.x", "tau_b.y", "tau_b.z"} == set(lines(found["torques"])) - {"limit"}
-    assert {"F_b.x", "F_b.y", "F_b.z", "main"} == set(lines(found["forces"])) - {"limit"}
-    for title in ("wheel speeds", "wheel torques", "wheel momenta"):
+    assert units["base torque"] == "[N m]"
+    assert units["base force"] == units["thrusters"] == "[N]"
+    assert units["joint torques"] == "[N m]"
+    assert units["wheel speed"] == "[rad/s]"
+    assert units["wheel torque"] == "[N m]"
+    assert units["wheel momentum"] == "[N m s]"
+    for title in ("base torque", "base force"):
+        assert {"x", "y", "z"} == set(lines(found[title])) - {"limit"}
+    assert {"main"} == set(lines(found["thrusters"])) - {"limit"}
+    for title in ("wheel speed", "wheel torque", "wheel momentum"):
         assert set(lines(found[title])) == {"spin", "idle", "limit"}
     for title in ("joints q_m", "joint rates qdot_m"):
         assert not {"spin", "idle"} & set(lines(found[title]))
     speed = limited.x[:, limited.state_names.index("qdot_m.spin")]
-    np.testing.assert_array_equal(lines(found["wheel speeds"])["spin"].get_ydata(), speed)
-    momentum = lines(found["wheel momenta"])["spin"].get_ydata()
+    np.testing.assert_array_equal(lines(found["wheel speed"])["spin"].get_ydata(), speed)
+    momentum = lines(found["wheel momentum"])["spin"].get_ydata()
     np.testing.assert_allclose(momentum, 0.05 * speed)
 
 
@@ -222,11 +222,11 @@ def levels(axes):
 
 def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
     found = panels(limited.plot())
-    assert levels(found["torques"]) == ([8.0], 1)
-    assert levels(found["forces"]) == ([22.0], 1)
-    assert levels(found["joint inputs tau_m"]) == ([300.0], 1)
-    assert levels(found["wheel speeds"]) == ([300.0], 1)
-    assert levels(found["wheel momenta"]) == ([15.0], 1)
+    assert levels(found["base torque"]) == ([8.0], 1)
+    assert levels(found["thrusters"]) == ([22.0], 1)
+    assert levels(found["joint torques"]) == ([300.0], 1)
+    assert levels(found["wheel speed"]) == ([300.0], 1)
+    assert levels(found["wheel momentum"]) == ([15.0], 1)
     assert levels(found["joint rates qdot_m"])[0] in ([0.05], [-0.05, 0.05])
     assert levels(found["joints q_m"]) == ([], 0)
     figure = limited.plot()

@@ -36,21 +36,21 @@ def test_groups_names_and_patterns_pick_panels_and_lines(motion):
     names = motion.state_names
     panels = drawn(motion, ["q_b.z", "*.joint_1", "F_b"])
     assert set(panels) == {
-        *("attitude q_b", "joints q_m", "joint rates qdot_m", "forces", "joint inputs tau_m")
+        *("attitude q_b", "joints q_m", "joint rates qdot_m", "base force", "joint torques")
     }
     np.testing.assert_array_equal(panels["attitude q_b"]["z"], motion.x[:, 2])
     np.testing.assert_array_equal(
         panels["joint rates qdot_m"]["joint_1"], motion.x[:, names.index("qdot_m.joint_1")]
     )
     assert list(panels["joints q_m"]) == ["joint_1"]
-    assert list(panels["forces"]) == ["F_b.x", "F_b.y", "F_b.z"]
-    torque = panels["joint inputs tau_m"]["tau_m.joint_1"]
+    assert list(panels["base force"]) == ["x", "y", "z"]
+    torque = panels["joint torques"]["joint_1"]
     np.testing.assert_array_equal(torque, motion.u[:, motion.input_names.index("tau_m.joint_1")])
 
 
 def test_states_alone_and_inputs_alone(motion):
     assert set(drawn(motion, "r_b")) == {"position r_b"}
-    assert set(drawn(motion, ["tau_m"])) == {"joint inputs tau_m"}
+    assert set(drawn(motion, ["tau_m"])) == {"joint torques"}
     assert drawn(motion, None).keys() == drawn(motion, ["*"]).keys()
 
 
