@@ -69,7 +69,8 @@ def saturation(
             f"has a least impulse of {item.least_impulse:g} N s, too large for a sample of "
             f"{time:g} s; give a longer sample="
             if time
-            else "is pulsed, which needs sampled commands; give sample=, or a sampled policy"
+            else "is pulsed, which needs sampled commands; give sample= (--sample), or a sampled "
+            "policy"
         )
         raise InputError(f"thruster '{name}' {why}")
     pulses = within.pulses._replace(

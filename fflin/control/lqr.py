@@ -274,8 +274,10 @@ def require_fixed_point(lin: LinearModel) -> None:
         for i in np.argsort(-np.abs(rate))
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]
-    advice = "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
-    advice += "a steady motion with moving=True"
+    advice = (
+        "linearise about a fixed point, with the q and u of fflin.equilibrium (--equilibrium, in "
+        "orbit --relative-equilibrium), or about a steady motion with moving=True"
+    )
     if lin.moving:
         advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
     raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")
