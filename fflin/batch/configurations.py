@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -128,22 +128,8 @@ class RandomConfigurations:
         return _placed(self.robot, self.start, stop - start, values)
 
 
-@dataclass(frozen=True, eq=False)
-class GivenConfigurations:
-    """Array (N, nq) of valid configurations."""
-
-    q: Array
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def rows(self, start: int, stop: int) -> Array:
-        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
-        return self.q[start:stop]
-
-
-# Configurations of a sweep; the rows of a grid and random rows are generated on demand.
-Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
+# Configurations of a sweep that are generated on demand.
+Configurations: TypeAlias = Grid | RandomConfigurations
 
 
 def grid(
@@ -253,31 +239,6 @@ def random_configurations(
     given = by_joint(given, robot.joint_names, robot.joint)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     return RandomConfigurations(robot, count, seed, checked, frozen(start))
-
-
-def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
-    """Return the points of a sweep as configurations of this robot."""
-    validation.instance("robot", robot, Robot, "a fflin.Robot")
-    if isinstance(q, GivenConfigurations):  # checked already
-        return q
-    if not isinstance(q, Grid | RandomConfigurations):
-        return GivenConfigurations(checked_configurations(robot, q))
-    # The robot may have other inputs or outputs, but its joints must be the same.
-    if q.robot.joints != robot.joints:
-        raise InputError(
-            f"q was made for '{q.robot.name}', whose joints differ from the joints of "
-            f"'{robot.name}'; make q for the robot that is swept"
-        )
-    return replace(q, robot=robot)
-
-
-def content(configurations: Configurations) -> dict[str, object]:
-    """Return all values that determine the rows, by name and in order."""
-    values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
-    of_joints = values.pop("axes", None) or values.pop("ranges", {})
-    values.pop("robot", None)
-    named = {f"{at} {name}": value for at, (name, value) in enumerate(of_joints.items())}
-    return {"of": type(configurations).__name__, **values, **named}
 
 
 def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:

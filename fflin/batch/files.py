@@ -44,13 +44,6 @@ _CHUNK_BYTES = 2**22
 _OVERHEAD = 2**16
 
 
-def check_format(path: Path) -> None:
-    """Raise an error if the file's ending is unknown, or if h5py is needed but not installed."""
-    writing.check_ending(path, FORMATS)
-    if path.suffix == ".h5":
-        hdf5()
-
-
 def hdf5() -> ModuleType:
     """Return h5py, or raise `MissingPackageError`."""
     h5py: ModuleType = optional_package("h5py", "HDF5 files need h5py", "fast")
@@ -66,7 +59,7 @@ def write_rows(
     path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
     """Write arrays with the same number of rows, and strings, with digests if `checksummed`."""
-    check_format(path)
+    writing.check_ending(path, FORMATS)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
     texts = {**texts, "constant": json.dumps(list(constants))}
@@ -120,7 +113,7 @@ def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
     """Return arrays, names of the arrays with one row for all points, strings, and `verified`."""
-    check_format(path)
+    writing.check_ending(path, FORMATS)
     arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)
     return arrays, json.loads(texts["constant"]), texts, verified
 
@@ -361,7 +354,9 @@ def require_room(path: Path, size: int) -> None:
 def output_path(out: str | Path) -> Path:
     """Return a path that can be written as a rows file, or raise `FileError`."""
     path = writing.as_path(out)
-    check_format(path)
+    writing.check_ending(path, FORMATS)
+    if path.suffix == ".h5":
+        hdf5()  # raises an error if h5py is not installed
     writing.check_output_path(path)
     writing.check_output_path(part_of(path))
     return path
