@@ -251,7 +251,7 @@ class ChunkJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
-        left = self.write(rows, out) if self._kernel else np.arange(len(rows["q"]))
+        left = self.write(rows, out)
         if not len(left):
             return []
         with _TURN, warnings.catch_warnings(record=True) as caught:
@@ -280,18 +280,10 @@ class ChunkJob:
             np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write rows in compiled code; return the rows for which this is not accurate."""
+        """Write rows in compiled code; return the rows for which it is not accurate or possible."""
         kernel, q = self._kernel, rows["q"]
-        assert kernel is not None
-        count = len(q)
-        if count < LANES:  # fill up the lanes by repeating the last row
-            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
-            for key, array in out.items():
-                more[key] = np.empty((LANES, *array.shape[1:]))
-            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
-            for key, array in out.items():
-                array[:] = more[key][:count]
-            return left[left < count]
+        if kernel is None or len(q) < LANES:  # too few rows for the kernel
+            return np.arange(len(q))
         with np.errstate(all="ignore"):
             if self.only_inertia:
                 good = kernel.sound(q, kernel.write_inverse(q, out["B_lower"]))

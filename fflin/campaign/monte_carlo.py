@@ -297,8 +297,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 def _header(job: CampaignJob) -> dict[str, object]:
     """Return the header of a campaign: everything that is not an array."""
-    plan, plant = job.plan, job.plant
-    robot = plant.robot
+    plan, plant, robot = job.plan, job.plant, job.plant.robot
     others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
     steered -= set() if pushed(plant.actuation) else {"r_b"}
@@ -311,8 +310,8 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "input_names": plant.actuation.names,
         "input_units": plant.actuation.units,
         "judged": [kind for kind, group in groups if group in steered],
-        "robot": plant.robot.name,
-        "urdf_sha256": plant.robot.urdf_sha256,
+        "robot": robot.name,
+        "urdf_sha256": robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,
         "dt": plan.times.dt,
         "engine": job.engine,
