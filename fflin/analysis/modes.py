@@ -1,7 +1,5 @@
 """Natural modes of a linear model: free-free frequencies, damping ratios, shapes."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
@@ -209,16 +207,11 @@ class Modes:
         said += [f"note: {note}" for note in self.notes]
         parts = [folded([each]) for each in said]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
-        rows += [
-            [
-                f"{mode.frequency:.6g}" if mode.oscillates else ".",
-                f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
-                f"{mode.time_constant:.4g}" if mode.pole.real else ".",
-                "unstable" if mode.unstable else "",
-                "",
-            ]
-            for mode in self.modes
-        ]
+        for mode in self.modes:
+            swing = f"{mode.frequency:.6g}", f"{mode.damping_ratio:.4g}"
+            decay = f"{mode.time_constant:.4g}" if mode.pole.real else "."
+            growth = "unstable" * mode.unstable
+            rows.append([*(swing if mode.oscillates else ".."), decay, growth, ""])
         left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
         for row, mode in zip(rows[1:], self.modes, strict=True):
             row[-1] = _percents(mode.energy, width() - left)

@@ -1,7 +1,5 @@
 """Relative equilibria of a rigid body in orbit, and their stability."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import permutations, product
 

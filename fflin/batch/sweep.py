@@ -286,7 +286,7 @@ class ChunkJob:
             return np.arange(len(q))
         with np.errstate(all="ignore"):
             if self.only_inertia:
-                good = kernel.sound(q, kernel.write_inverse(q, out["B_lower"]))
+                good = kernel.write_inverse(q, out["B_lower"])
             else:
                 good = self._write_anywhere(kernel, rows, out)
         return np.flatnonzero(~good)
@@ -308,7 +308,7 @@ class ChunkJob:
             u = actuation.in_base_axes(chart, rows["u0"])
         q_m, nv = state.joint_positions(q), nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
-        c, judged = kernel.write(q, nu, q_m, u, A, B)
+        c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
         f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
@@ -317,7 +317,7 @@ class ChunkJob:
             out["_drift"][:] = drift(state, f0, rates.gravity)
         # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
         # checked, because it is finite if q0 and f0 are valid.
-        good = kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
+        good = good & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(values, values) < LARGEST
         return good

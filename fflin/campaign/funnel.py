@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +17,7 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.intervals import until_failure
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
@@ -113,18 +113,16 @@ class Funnel(Design):
     True
     """
 
-    VECTORS: ClassVar = ("t", "tried", "at", "knots")
-
     robot: Robot
-    t: Array
-    tried: Array
+    t: Vector
+    tried: Vector
     outcomes: Array
     goal: str
     within: str
     confidence: float
-    at: Array
+    at: Vector
     P: Array
-    knots: Array
+    knots: Vector
     q: Array
     v: Array
     u: Array

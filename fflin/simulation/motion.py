@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ import pinocchio as pin
 from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import as_path, check_ending
 from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
 from fflin.dynamics.impact import Impact, joint_called
@@ -125,23 +125,17 @@ class Motion(Design):
     True
     """
 
-    OPEN: ClassVar = ("limits",)
-    VECTORS: ClassVar = (
-        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias", "starts"),
-        "mode_rotations",
-    )
-
-    t: Array
+    t: Vector
     q: Array
     v: Array
     x: Array
     u: Array
     target: Array
     prediction: Array
-    energy: Array
+    energy: Vector
     momentum: Array
-    momentum_drift: Array
-    placement: Array
+    momentum_drift: Vector
+    placement: Vector
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     state_units: tuple[str, ...]
@@ -150,22 +144,22 @@ class Motion(Design):
     robot: str
     urdf_sha256: str
     stopped: str
-    com_drift: Array = field(default_factory=lambda: np.zeros(0))
+    com_drift: Vector = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
     _nominal: str = field(default="", kw_only=True)  # checksum of a campaign's robot; not saved
     wheels: tuple[str, ...] = field(default_factory=tuple)
-    wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
+    wheel_inertias: Vector = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = field(default_factory=tuple)
     limit_names: tuple[str, ...] = field(default_factory=tuple)
-    limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    limits: Open = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
     phases: tuple[str, ...] = field(default_factory=tuple)
-    starts: Array = field(default_factory=lambda: np.zeros(0))
+    starts: Vector = field(default_factory=lambda: np.zeros(0))
     _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
-    mode_rotations: Array = field(default_factory=lambda: np.zeros(0))
+    mode_rotations: Vector = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -280,7 +281,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
     channel = None if law is None else plan.channel(law, lambda t, q, v: v[plan.wheels])
-    ask = channel.ask if channel and channel.continuous else None
+    ask = partial(channel.begin, 0) if channel and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
     follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt

@@ -329,7 +329,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
-            rate = lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0
+            rate = lin.A @ at + lin.B @ (channel.begin(0, at) - u0) + lin.f0
             after = after + weight * dt / 6.0 * rate
         return after
 
