@@ -20,7 +20,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, Indices, frozen, vector
+from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
 from fflin.batch.configurations import (
     Configurations,
     GivenConfigurations,
@@ -42,8 +42,6 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +17,7 @@ from fflin.base.record import Design
 from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
+    ArrayLike,
     Vector,
     as_double,
     by_name,
@@ -40,9 +40,6 @@ from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
