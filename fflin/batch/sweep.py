@@ -236,13 +236,10 @@ class ChunkJob:
         self.linearizer = Linearizer(robot, **options)
         self._engine = checked_engine(engine)
         prepared = self.linearizer.prepared
-        if engine == "compiled":
-            if prepared.sensing is not None:
-                raise InputError(
-                    "engine='compiled' is not possible, because the outputs are not the state; "
-                    "leave engine out"
-                )
-            prepared.kernel()  # raises an error if there is none
+        if engine == "compiled" and (reason := prepared.not_compilable):
+            raise InputError(
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
+            )
         # If a free robot is at rest about its own reference, A and f0 are constant, so only B is
         # computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -266,7 +263,7 @@ class ChunkJob:
     def _kernel(self) -> RowAccelerations | None:
         """Compiled accelerations for many points at once; None if Python computes the points."""
         prepared = self.linearizer.prepared
-        if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
+        if self._engine == "python" or prepared.not_compilable:
             return None
         return prepared.kernel()
 
