@@ -24,7 +24,7 @@ from fflin.robot.inputs import BaseForce as BaseForce
 from fflin.robot.inputs import JointTorque as JointTorque
 from fflin.robot.inputs import Thruster as Thruster
 from fflin.robot.inputs import ReactionWheel as ReactionWheel
-from fflin.robot.robot_files import load_inputs as load_inputs
+from fflin.robot.loading import load_inputs as load_inputs
 
 # Outputs
 from fflin.robot.outputs import FullState as FullState
@@ -141,9 +141,9 @@ from fflin.batch.configurations import random_configurations as random_configura
 from fflin.batch.configurations import RandomConfigurations as RandomConfigurations
 
 # Figures
-from fflin.analysis.plots import plot_matrices as plot_matrices
-from fflin.analysis.plots import plot_check as plot_check
-from fflin.analysis.plots import plot_modes as plot_modes
+from fflin.control.plots import plot_matrices as plot_matrices
+from fflin.control.plots import plot_check as plot_check
+from fflin.control.plots import plot_modes as plot_modes
 from fflin.campaign.plots import plot_validity as plot_validity
 from fflin.campaign.plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles

@@ -107,15 +107,18 @@ class TomlFile:
         return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
-def flat(table: Mapping[str, object]) -> dict[str, object]:
-    """Flatten nested tables: ``a.b = 1``, read as a table in a table, becomes the name "a.b"."""
-    while any(isinstance(value, dict) and value for value in table.values()):
+def flat(table: object) -> object:
+    """Flatten nested tables: ``a.b = 1``, read as a table in a table, becomes the name "a.b".
+
+    A value that is not a table is returned unchanged.
+    """
+    while isinstance(table, dict) and any(isinstance(x, dict) and x for x in table.values()):
         pairs = []
         for key, value in table.items():
             inner = value if isinstance(value, dict) and value else {"": value}
             pairs += [(f"{key}.{below}" if below else key, x) for below, x in inner.items()]
         table = dict(pairs)
-    return dict(table)
+    return table
 
 
 def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:

@@ -11,11 +11,9 @@ References
 R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sections 6.2 and 6.5.
 """
 
-from __future__ import annotations
-
 from fflin.kernel import vectors as vec
-from fflin.kernel.lanes import inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
+from fflin.kernel.vectors import load, splat, store
 
 # Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
 # by c alone, and Psi''.
@@ -25,41 +23,34 @@ VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
-@inlined
 def _inertia(work, at, place, bodies, first):
     """Write a body's inertia about its joint in base axes: m, m c, and R I R^T."""
     axes = vec.get_columns(work, place)
     store(work, at, load(bodies, first))
     vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
-    xx, xy, xz = vec.get3(bodies, first + 4)
-    yy, yz, zz = vec.get3(bodies, first + 7)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(bodies, first + 4)
     u = vec.product(axes, (xx, xy, xz))
     v = vec.product(axes, (xy, yy, yz))
     w = vec.product(axes, (xz, yz, zz))
     _, yy, yz = vec.product(axes, (u[1], v[1], w[1]))
     zz = vec.product(axes, (u[2], v[2], w[2]))[2]
-    vec.put3(work, at + 4, vec.product(axes, (u[0], v[0], w[0])))
-    vec.put3(work, at + 7, (yy, yz, zz))
+    vec.put6(work, at + 4, (vec.product(axes, (u[0], v[0], w[0])), (yy, yz, zz)))
 
 
-@inlined
 def spatial_inertia_times(work, at, motion):
     """Return a spatial inertia times a motion vector, as moment and force."""
     m, h = load(work, at), vec.get3(work, at + 1)
-    xx, xy, xz = vec.get3(work, at + 4)
-    yy, yz, zz = vec.get3(work, at + 7)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
     w, v = motion
     turning = vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
     return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
-@inlined
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies, from the base outwards."""
     places, own = tree.places, tree.own
     one, zero = splat(work, 1.0), splat(work, 0.0)
-    vec.put3(work, places, (1.0, 0.0, 0.0))
-    vec.put3(work, places + 3, (0.0, 1.0, 0.0))
+    vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
     _inertia(work, own, places, tree.bodies, 0)
     for body in range(1, len(tree.parent)):
@@ -84,7 +75,6 @@ def outwards(work, tree, q):
         _inertia(work, own + body * INERTIA, at, tree.bodies, body * INERTIA)
 
 
-@inlined
 def inwards(work, tree):
     """Write the packed M and the composite inertias, from the tips inwards."""
     bodies = len(tree.parent)
@@ -103,8 +93,7 @@ def inwards(work, tree):
         moment, force = spatial_inertia_times(work, at, axis)
         # Add the composite inertia, expressed at the parent's joint, to the parent's inertia.
         m, h, d = load(work, at), vec.get3(work, at + 1), vec.get3(work, place + 9)
-        xx, xy, xz = vec.get3(work, at + 4)
-        yy, yz, zz = vec.get3(work, at + 7)
+        (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
         e = vec.plus(h, vec.times(d, m))
         px, py, pz = d[0] * (h[0] + e[0]), d[1] * (h[1] + e[1]), d[2] * (h[2] + e[2])
         xy = xy - (d[0] * e[1] + h[0] * d[1])
@@ -113,8 +102,7 @@ def inwards(work, tree):
         to = inertias + tree.parent[body] * INERTIA
         vec.add(work, to, m)
         vec.add3(work, to + 1, e)
-        vec.add3(work, to + 4, (xx + (py + pz), xy, xz))
-        vec.add3(work, to + 7, (yy + (px + pz), yz, zz + (px + py)))
+        vec.add6(work, to + 4, ((xx + (py + pz), xy, xz), (yy + (px + pz), yz, zz + (px + py))))
         above = body
         while above > 0:
             place = places + above * PLACE
@@ -126,15 +114,13 @@ def inwards(work, tree):
             # Move the moment to the parent's joint.
             moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
             above = tree.parent[above]
-        start, share = packed + tree.target[pair], tree.share[pair]
+        row = vec.times6((moment, force), tree.share[pair])
+        vec.add6(work, packed + tree.target[pair], row)
         pair += 1
-        vec.add3(work, start, vec.times(moment, share))
-        vec.add3(work, start + 3, vec.times(force, share))
     # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
     m = load(work, inertias)
     hx, hy, hz = vec.get3(work, inertias + 1)
-    xx, xy, xz = vec.get3(work, inertias + 4)
-    yy, yz, zz = vec.get3(work, inertias + 7)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, inertias + 4)
     vec.put6(work, packed, ((xx, xy, yy), (xz, yz, zz)))
     vec.put6(work, packed + 6, ((zero, hz, -hy), (m, -hz, zero)))
     vec.put3(work, packed + 12, (hx, zero, m))
@@ -144,7 +130,6 @@ def inwards(work, tree):
         vec.add(work, at, tree.armature[index])
 
 
-@inlined
 def factorise(work, tree):
     """Factorise M = L^T D L: replace the packed M by the unit L, and write 1 / D at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
@@ -162,25 +147,27 @@ def factorise(work, tree):
             store(work, row + t, share)
 
 
-@inlined
+def solve_inwards(work, tree, x, first):
+    """Replace a force f at the index `first` of x by L^-T f; M must be factorised."""
+    for k in range(len(tree.row) - 1, -1, -1):
+        value, row = load(x, first + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            at = first + tree.path[row + t]
+            store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
+
+
 def solve(work, tree, x):
     """Replace a force f at x by the acceleration M^-1 f; M must be factorised."""
-    packed, size = tree.packed, len(tree.row)
-    for k in range(size - 1, -1, -1):
-        value, row = load(work, x + k), tree.row[k]
-        for t in range(tree.depth[k]):
-            at = x + tree.path[row + t]
-            store(work, at, load(work, at) - load(work, packed + row + t) * value)
-        pivot = load(work, tree.scaled + row + tree.depth[k])
-        store(work, x + k, value * pivot)
-    for k in range(size):
-        value, row = load(work, x + k), tree.row[k]
+    packed = tree.packed
+    solve_inwards(work, tree, work, x)
+    for k in range(len(tree.row)):
+        row = tree.row[k]
+        value = load(work, x + k) * load(work, tree.scaled + row + tree.depth[k])
         for t in range(tree.depth[k]):
             value = value - load(work, packed + row + t) * load(work, x + tree.path[row + t])
         store(work, x + k, value)
 
 
-@inlined
 def invert_factor(work, tree):
     """Replace L by U = L^-1, and write V = L^-1 D^-1."""
     packed, scaled = tree.packed, tree.scaled
@@ -198,7 +185,6 @@ def invert_factor(work, tree):
             store(work, scaled + (tree.row[k] + t), total * pivot)
 
 
-@inlined
 def multiply(work, tree, judged):
     """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
@@ -218,7 +204,6 @@ def multiply(work, tree, judged):
     store(work, judged, coupling)
 
 
-@inlined
 def joint_axis(work, tree, body):
     """Return the spatial axis of a joint, angular and linear, per unit of its coordinate."""
     z = vec.get3(work, tree.places + (body * PLACE + 6))
@@ -226,27 +211,23 @@ def joint_axis(work, tree, body):
     return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
 
 
-@inlined
 def motion_cross(velocity, along):
     """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
-@inlined
 def at_joint(work, at, place):
     """Shift the parent's motion vector at `at` to the origin of a joint."""
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
-@inlined
 def at_parent(work, place, force):
     """Shift a spatial force from a joint's origin to the origin of its parent."""
     return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
-@inlined
 def move_bodies(work, tree, nu):
     """Write velocities and accelerations without c, from the base outwards, for v_b = 0."""
     for entry in range(MOTION):
@@ -266,7 +247,6 @@ def move_bodies(work, tree, nu):
         vec.put6(work, at + BIAS, vec.plus6(bias, vec.times6(psi, rate)))
 
 
-@inlined
 def load_bodies(work, tree):
     """Write the inertial force of each single body, including its gyroscopic torque."""
     for body in range(len(tree.parent)):
@@ -280,13 +260,10 @@ def load_bodies(work, tree):
         vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(tree.stored_body)):
         body = tree.stored_body[index]
-        turning = vec.cross(
-            vec.get3(work, tree.motion + body * MOTION), stored_momentum(work, tree, index)
-        )
-        vec.add3(work, tree.load + body * LOAD + FORCE, turning)
+        w, h = vec.get3(work, tree.motion + body * MOTION), stored_momentum(work, tree, index)
+        vec.add3(work, tree.load + body * LOAD + FORCE, vec.cross(w, h))
 
 
-@inlined
 def load_carried(work, tree, u):
     """Subtract the body-fixed wrenches of inputs from the forces of the bodies."""
     for index in range(len(tree.wrench_body)):
@@ -294,9 +271,8 @@ def load_carried(work, tree, u):
         vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
 
 
-@inlined
-def load_momenta(work, tree):
-    """Write the momentum, the moments G and the stored momentum of each single body."""
+def collect_momenta(work, tree):
+    """Write the momentum, the moments G and the stored momentum of each subtree."""
     zero = splat(work, 0.0)
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD
@@ -305,73 +281,17 @@ def load_momenta(work, tree):
         h = vec.get3(work, own + 1)
         vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
         # The matrix of second moments of mass is tr(I) / 2 times the identity, minus I.
-        xx, xy, xz = vec.get3(work, own + 4)
-        yy, yz, zz = vec.get3(work, own + 7)
+        (xx, xy, xz), (yy, yz, zz) = vec.get6(work, own + 4)
         trace = 0.5 * (xx + yy + zz)
-        x = trace - xx, -xy, -xz
-        y = -xy, trace - yy, -yz
-        z = -xz, -yz, trace - zz
-        vec.put3(work, at + MOMENTS, vec.plus(vec.times(v, h[0]), vec.cross(w, x)))
-        vec.put3(work, at + MOMENTS + 3, vec.plus(vec.times(v, h[1]), vec.cross(w, y)))
-        vec.put3(work, at + MOMENTS + 6, vec.plus(vec.times(v, h[2]), vec.cross(w, z)))
+        second = (trace - xx, -xy, -xz), (-xy, trace - yy, -yz), (-xz, -yz, trace - zz)
+        for axis in range(3):
+            column = vec.plus(vec.times(v, h[axis]), vec.cross(w, second[axis]))
+            vec.put3(work, at + MOMENTS + 3 * axis, column)
         vec.put3(work, at + STORED, (zero, zero, zero))
         vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
     for index in range(len(tree.stored_body)):
         at = tree.load + tree.stored_body[index] * LOAD + STORED
         vec.add3(work, at, stored_momentum(work, tree, index))
-
-
-@inlined
-def stored_momentum(work, tree, index):
-    """Return a stored momentum in base axes."""
-    axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
-    return vec.product(axes, vec.get3(tree.stored, 3 * index))
-
-
-@inlined
-def carried_wrench(work, tree, index):
-    """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
-    axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
-    moment, force = vec.get6(tree.wrench, 6 * index)
-    return vec.product(axes, moment), vec.product(axes, force)
-
-
-@inlined
-def write_columns(work, tree):
-    """Write the generalised force per unit of each body-fixed input."""
-    count = len(tree.wrench_body)
-    for entry in range(len(tree.row) * count):
-        store(work, tree.columns + entry, 0.0)
-    for index in range(count):
-        body, wrench = tree.wrench_body[index], carried_wrench(work, tree, index)
-        while body > 0:
-            value = vec.dot6(joint_axis(work, tree, body), wrench)
-            vec.add(work, tree.columns + tree.coordinate[body] * count + index, value)
-            wrench = at_parent(work, tree.places + body * PLACE, wrench)
-            body = tree.parent[body]
-        for axis in range(3):
-            entry = tree.columns + axis * count + index
-            store(work, entry, wrench[0][axis])
-            store(work, entry + 3 * count, wrench[1][axis])
-
-
-@inlined
-def collect(work, tree):
-    """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
-    for index in range(len(tree.row)):
-        store(work, tree.bias + index, 0.0)
-    for body in range(len(tree.parent) - 1, 0, -1):
-        force = vec.get6(work, tree.load + body * LOAD + FORCE)
-        value = vec.dot6(joint_axis(work, tree, body), force)
-        vec.add(work, tree.bias + tree.coordinate[body], value)
-        to = tree.load + tree.parent[body] * LOAD + FORCE
-        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
-    vec.add6(work, tree.bias, vec.get6(work, tree.load + FORCE))
-
-
-@inlined
-def collect_momenta(work, tree):
-    """Sum the bodies' momenta over subtrees, from the tips inwards."""
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         above = tree.load + tree.parent[body] * LOAD
@@ -385,7 +305,54 @@ def collect_momenta(work, tree):
             vec.add3(work, above + MOMENTS + 3 * index, column)
 
 
-@inlined
+def stored_momentum(work, tree, index):
+    """Return a stored momentum in base axes."""
+    axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
+    return vec.product(axes, vec.get3(tree.stored, 3 * index))
+
+
+def carried_wrench(work, tree, index):
+    """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
+    axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
+    moment, force = vec.get6(tree.wrench, 6 * index)
+    return vec.product(axes, moment), vec.product(axes, force)
+
+
+def add_column(work, at, width, force):
+    """Add a moment and a force to the first six rows of a column, the rows of the base."""
+    for index in range(3):
+        vec.add(work, at + index * width, force[0][index])
+        vec.add(work, at + (3 + index) * width, force[1][index])
+
+
+def write_columns(work, tree):
+    """Write the generalised force per unit of each body-fixed input."""
+    count = len(tree.wrench_body)
+    for entry in range(len(tree.row) * count):
+        store(work, tree.columns + entry, 0.0)
+    for index in range(count):
+        body, wrench = tree.wrench_body[index], carried_wrench(work, tree, index)
+        while body > 0:
+            value = vec.dot6(joint_axis(work, tree, body), wrench)
+            vec.add(work, tree.columns + tree.coordinate[body] * count + index, value)
+            wrench = at_parent(work, tree.places + body * PLACE, wrench)
+            body = tree.parent[body]
+        add_column(work, tree.columns + index, count, wrench)
+
+
+def collect(work, tree):
+    """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
+    for index in range(len(tree.row)):
+        store(work, tree.bias + index, 0.0)
+    for body in range(len(tree.parent) - 1, 0, -1):
+        force = vec.get6(work, tree.load + body * LOAD + FORCE)
+        value = vec.dot6(joint_axis(work, tree, body), force)
+        vec.add(work, tree.bias + tree.coordinate[body], value)
+        to = tree.load + tree.parent[body] * LOAD + FORCE
+        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
+    vec.add6(work, tree.bias, vec.get6(work, tree.load + FORCE))
+
+
 def accelerate_bodies(work, tree):
     """Add what c contributes to accelerations and Psi'' (outwards), then to forces (inwards)."""
     vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
@@ -398,12 +365,8 @@ def accelerate_bodies(work, tree):
         added = at_joint(work, above + ADDED, place)
         acceleration = vec.plus6(added, at_joint(work, above + BIAS, place))
         velocity = at_joint(work, above + VELOCITY, place)
-        psi = vec.get6(work, at + PSI)
-        vec.put6(
-            work,
-            at + PSI2,
-            vec.plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)),
-        )
+        turned = motion_cross(velocity, vec.get6(work, at + PSI))
+        vec.put6(work, at + PSI2, vec.plus6(motion_cross(acceleration, axis), turned))
         vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD

@@ -22,10 +22,6 @@ S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of r
 using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 """
 
-from __future__ import annotations
-
-from collections import namedtuple
-
 import numpy as np
 
 from fflin.base.validation import Array, Mask
@@ -36,11 +32,10 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
-from fflin.kernel.lanes import compiled, inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
+from fflin.kernel.vectors import compiled, load, splat, store
 
 
-@inlined
 def _coriolis(work, at, w):
     """Return the moment and force 2 B w of a joint's subtree."""
     G = vec.get_columns(work, at + MOMENTS)
@@ -51,28 +46,16 @@ def _coriolis(work, at, w):
     return moment, vec.plus(force, force)
 
 
-@inlined
 def _coriolis_transposed(work, at, along):
     """Return the moment of 2 B^T s for a motion vector s; the force of 2 B^T s is zero."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
-    moment = vec.plus(
-        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
-    )
+    moment = vec.minus(vec.times(w, trace), vec.across(G, w))
+    moment = vec.plus(moment, vec.cross(vec.get3(work, at + MOMENTUM), along[1]))
     return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
-@inlined
-def _add_column(work, at, width, force):
-    """Add a moment and a force to the first six rows of a column, the rows of the base."""
-    for index in range(3):
-        vec.add(work, at + index * width, force[0][index])
-        vec.add(work, at + (3 + index) * width, force[1][index])
-
-
-@inlined
 def differentiate(work, tree):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
@@ -119,21 +102,17 @@ def differentiate(work, tree):
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
-        _add_column(work, tree.lower + column, width, by_q)
-        _add_column(work, tree.lower + (column + 6 + n), width, by_v)
+        bodies.add_column(work, tree.lower + column, width, by_q)
+        bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
     # The base's force over omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
         weight = inertia_times(work, tree.inertias, turning)
-        moment, force = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
-        for part in range(3):
-            row = tree.lower + (part * width + 6 + n + index)
-            store(work, row, moment[part])
-            store(work, row + 3 * width, force[part])
+        total = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
+        bodies.add_column(work, tree.lower + (6 + n + index), width, total)
 
 
-@inlined
 def _push(work, tree, by_u):
     """Write the derivatives over the inputs: columns of M^-1, or linear combinations of them."""
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
@@ -150,7 +129,6 @@ def _push(work, tree, by_u):
             store(work, by_u + row * count + tree.input[index], total)
 
 
-@inlined
 def _solve(work, tree, slopes):
     """Write -M^-1 times the derivatives of the forces, six columns at a time."""
     size = len(tree.row)
@@ -171,7 +149,6 @@ def _solve(work, tree, slopes):
             vec.put6(work, slopes + column + row * width, total)
 
 
-@inlined
 def _pack(rows, first, lanes):
     """Copy the rows of eight points into an array (entries, lanes)."""
     for entry in range(len(lanes)):
@@ -179,7 +156,6 @@ def _pack(rows, first, lanes):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
-@inlined
 def _unpack(work, start, entries, out, first, offset):
     """Copy entries of a laned array to the rows of eight points, from column `offset` on."""
     for entry in range(entries):
@@ -191,6 +167,7 @@ def _unpack(work, start, entries, out, first, offset):
 def derive(tree, points, out, lanes, work):
     """Write the results of `RowAccelerations` at eight or more points, which may be at rest."""
     q, nu, force, u = points
+    q_lanes, nu_lanes, force_lanes, u_lanes = lanes
     c, A, by_u, judged = out
     size = len(tree.row)
     slopes, moves = tree.size, len(nu) > 0
@@ -200,16 +177,15 @@ def derive(tree, points, out, lanes, work):
         # If the last block has fewer than eight points, it overlaps the block before and fills all
         # lanes.
         first = min(block, len(q) - LANES)
-        _pack(q, first, lanes.q)
-        bodies.outwards(work, tree, lanes.q)
+        _pack(q, first, q_lanes)
+        bodies.outwards(work, tree, q_lanes)
         if moves:
-            _pack(nu, first, lanes.nu)
-            _pack(force, first, lanes.force)
-            _pack(u, first, lanes.u)
-            bodies.move_bodies(work, tree, lanes.nu)
+            _pack(nu, first, nu_lanes)
+            _pack(force, first, force_lanes)
+            _pack(u, first, u_lanes)
+            bodies.move_bodies(work, tree, nu_lanes)
             bodies.load_bodies(work, tree)
-            bodies.load_carried(work, tree, lanes.u)
-            bodies.load_momenta(work, tree)
+            bodies.load_carried(work, tree, u_lanes)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
         for k in range(size):  # `factorise` overwrites the diagonal of the packed M
@@ -220,7 +196,7 @@ def derive(tree, points, out, lanes, work):
             bodies.collect(work, tree)
             bodies.collect_momenta(work, tree)
             for index in range(size):
-                value = load(lanes.force, index) - load(work, tree.bias + index)
+                value = load(force_lanes, index) - load(work, tree.bias + index)
                 store(work, tree.c + index, value)
             bodies.solve(work, tree, tree.c)
         bodies.invert_factor(work, tree)
@@ -240,15 +216,12 @@ def derive(tree, points, out, lanes, work):
 _FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is accurate
 
 
-class Packed(namedtuple("Packed", "q nu force u")):
-    """Arrays of eight points; their second axis is the lane."""
-
-
 class RowAccelerations:
     """Accelerations at rows of points, their derivatives and M^-1, by the compiled kernel.
 
-    The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy at each point; see
-    `Inertia`.
+    Its methods return whether (N,) the results are accurate: M is well-conditioned and all angles
+    are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy of
+    M^-1; see `Inertia`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -258,15 +231,15 @@ class RowAccelerations:
         self._work = tree.size + nv * state.nx + nv * nu + 1
         self._least_coupling = 0.999 * nv
 
-    def write_inverse(self, q: Array, by_u: Array) -> Array:
-        """Write the derivatives over u (N, 6 + n, nu); return the sums of couplings (N,)."""
+    def write_inverse(self, q: Array, by_u: Array) -> Mask:
+        """Write the derivatives over u (N, 6 + n, nu)."""
         none = np.empty((0, 0))
         return self._derive((q, none, none, none), none, none, by_u)
 
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
-    ) -> tuple[Array, Array]:
-        """Write the derivatives of accelerations; return c (N, 6 + n) and sums of couplings (N,).
+    ) -> tuple[Array, Mask]:
+        """Write the derivatives of accelerations; return c (N, 6 + n) as well.
 
         The lower half of each A (N, nx, nx) gets the derivatives over the state. A and by_u are
         C-contiguous; nu and u are in base axes.
@@ -276,23 +249,16 @@ class RowAccelerations:
         c = np.empty(nu.shape)
         return c, self._derive((q, nu, force, u), c, A.reshape(len(q), -1), by_u)
 
-    def _derive(self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array) -> Array:
+    def _derive(self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array) -> Mask:
         judged = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,
             # numba would compile a second function for read-only arrays.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
             (c, A, by_u.reshape(len(by_u), -1), judged),
-            Packed(*map(work_space, self._sizes)),
+            tuple(map(work_space, self._sizes)),  # their second axis is the lane
             work_space(self._work),
         )
-        return judged[:, 0]
-
-    def sound(self, q: Array, judged: Array) -> Mask:
-        """Return whether (N,) M is well-conditioned and all angles are below 1e6 rad."""
         # A zero pivot gives NaN, and comparisons with NaN are false.
-        q_m = q[:, 7:]
         good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
-        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
-            return good
-        return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
+        return good[:, 0] & (np.abs(points[0][:, 7:]) < _FARTHEST).all(axis=1)

@@ -10,18 +10,13 @@ in base axes. Position and linear velocity of the base are left out, because the
 about the initial position of the base's origin. Positions are relative to this point.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
-
-import numpy as np
 
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
-from fflin.kernel.arguments import FLAGS, INDICES, LANED, REALS, WHOLE, Kind, Struct
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
-from fflin.kernel.lanes import angle, called, chosen, inlined, load, store
-from fflin.kernel.tree import Tree
+from fflin.kernel.tree import FLAGS, INDICES, LANED, REALS, TREE, Struct
+from fflin.kernel.vectors import angle, called, chosen, load, store
 
 
 class Mechanics(
@@ -64,14 +59,6 @@ class CommonPoint(Point):
     """Point that is common to all lanes."""
 
 
-_OF_TREE = {
-    INDICES: "parent index coordinate target row depth path driven wrench_body input stored_body",
-    WHOLE: "entries places own inertias packed scaled diagonal square motion load bias c columns "
-    "lower held size",
-    LANED: "fixed bodies wrench stored stiffness damping",
-}
-_AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
-TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
 COMMON_POINT = Struct(CommonPoint)
 _OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
@@ -85,7 +72,6 @@ def configure(work, robot, q):
     bodies.inwards(work, robot.tree)
 
 
-@inlined
 def joint_position(robot, q, joint):
     """Return the position of a joint; the angle of a continuous joint is in (-pi, pi]."""
     at = robot.index[joint]
@@ -95,13 +81,11 @@ def joint_position(robot, q, joint):
     return value / load(robot.scale, joint)
 
 
-@inlined
 def seen(robot, q):
     """Return the base's quaternion relative to the reference."""
     return vec.quaternion_times(vec.attitude(robot.origin), vec.attitude(q))
 
 
-@inlined
 def apply_faults(faults, triads, t, u, given):
     """Write the inputs that faulty actuators produce for a command u at a time t."""
     for index in range(len(faults.gain)):
@@ -112,7 +96,6 @@ def apply_faults(faults, triads, t, u, given):
         vec.put3(given, at, vec.product(columns, vec.get3(given, at)))
 
 
-@inlined
 def turn_held(robot, point):
     """Rotate reference-frame wrenches to base axes."""
     pushing = point.pushing
@@ -122,7 +105,6 @@ def turn_held(robot, point):
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
 
-@inlined
 def push(work, tree, pushing):
     """Write the generalised force of inputs in base axes at the offset of c."""
     size, count = len(tree.row), len(tree.wrench_body)
@@ -187,14 +169,6 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 
-@inlined
-def begin_step(reference):
-    """Set the sums of a step to zero."""
-    for entry in range(STEP_IMPULSE, SUMS):
-        store(reference.sums, entry, 0.0)
-
-
-@inlined
 def add_wrench(work, robot, reference, point, weight, moment):
     """Add the external wrench at a stage to the sums of a step.
 
@@ -209,25 +183,21 @@ def add_wrench(work, robot, reference, point, weight, moment):
     torque = vec.plus(vec.product(axes, moments), vec.cross(position, vec.plus(force, falls)))
     torque = vec.plus(torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls))
     force = vec.plus(force, falls)
-    vec.add3(reference.sums, STEP_IMPULSE, vec.times(force, weight))
-    vec.add3(reference.sums, STEP_IMPULSE + 3, vec.times(torque, weight))
+    vec.add6(reference.sums, STEP_IMPULSE, vec.times6((force, torque), weight))
     vec.add3(reference.sums, STEP_SHIFT, vec.times(force, moment))
 
 
-@inlined
 def end_step(reference, h):
-    """Add the sums of a finished step of h [s] to the sums up to now."""
+    """Add the sums of a finished step of h [s] to the sums up to now, and set them to zero."""
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
-    vec.add3(
-        reference.sums,
-        SHIFT,
-        vec.times(vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT)), per_mass),
-    )
+    shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
+    vec.add3(reference.sums, SHIFT, vec.times(shift, per_mass))
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
+    for entry in range(STEP_IMPULSE, SUMS):
+        store(reference.sums, entry, 0.0)
 
 
-@inlined
 def kept_at(reference, t):
     """Return the reference of linear and angular momentum and of the centre of mass."""
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
@@ -236,7 +206,6 @@ def kept_at(reference, t):
     return momentum, vec.plus(shift, flown)
 
 
-@inlined
 def start_at(work, robot, reference, point):
     """Write the initial momentum and centre of mass at a point whose M is already computed."""
     axes, tree = vec.axes_of(point.q), robot.tree
@@ -246,13 +215,11 @@ def start_at(work, robot, reference, point):
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
     linear = vec.times(vec.product(axes, linear), -1.0)
     angular = vec.minus(vec.cross(position, linear), vec.product(axes, angular))
-    vec.put3(reference.start, 0, linear)
-    vec.put3(reference.start, 3, angular)
+    vec.put6(reference.start, 0, (linear, angular))
     lever = vec.times(vec.product(axes, lever), load(reference.per_mass, 0))
     vec.put3(reference.start, 6, vec.plus(position, lever))
 
 
-@inlined
 def _momentum_error(work, robot, nu, momentum):
     """Return a given (angular, linear) momentum in base axes minus the robot's momentum at nu."""
     tree = robot.tree
@@ -267,7 +234,6 @@ def _momentum_error(work, robot, nu, momentum):
     return angular, linear
 
 
-@inlined
 def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
@@ -285,8 +251,7 @@ def impose(work, robot, reference, point, t):
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
     # Solve with the base's rigid-body block of M, using the inertia about the centre of mass.
-    xx, xy, xz = vec.get3(work, tree.inertias + 4)
-    yy, yz, zz = vec.get3(work, tree.inertias + 7)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))
     p, q, r = lever[0] * d[0], lever[1] * d[1], lever[2] * d[2]
@@ -296,5 +261,4 @@ def impose(work, robot, reference, point, t):
     inverse = 1.0 / (a * x + f * y + g * z)
     by = (x, y, z), (y, a * c - g * g, f * g - a * h), (z, f * g - a * h, a * b - f * f)
     w = vec.times(vec.product(by, about), inverse)
-    vec.add3(nu, 0, w)
-    vec.add3(nu, 3, vec.plus(vec.times(linear, per_mass), vec.cross(d, w)))
+    vec.add6(nu, 0, (w, vec.plus(vec.times(linear, per_mass), vec.cross(d, w))))

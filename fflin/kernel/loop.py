@@ -1,6 +1,8 @@
-"""The closed loop: a policy, forward dynamics, steps on the manifold, and statistics of a run."""
+"""The closed loop: policy, actuator channel, steps on the manifold, and statistics of a run.
 
-from __future__ import annotations
+The channel applies limits, sample and hold, delay, pulses and wheel speeds to the commands of the
+policy. The Python engine and the compiled engine both call its functions; see `control.channel`.
+"""
 
 from collections import namedtuple
 
@@ -9,11 +11,131 @@ import numpy as np
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
-from fflin.kernel.arguments import FLAG, INDICES, LANED, REAL, REALS, Opener, Struct
-from fflin.kernel.channel import CHANNEL, is_asked, transmit
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
-from fflin.kernel.lanes import angle, below, chosen, compiled, inlined, load, root, store
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
+from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
+from fflin.kernel.vectors import angle, below, chosen, compiled, load, root, store, whole
+
+
+class Wheels(
+    namedtuple("Wheels", "at row least_torque most_torque least_speed most_speed stiffness")
+):
+    r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
+
+    Fields of each wheel: the index of its input (`at`), the index of its speed in nu (`row`), the
+    limits of its torque [N m] and speed [rad/s], and the stiffness J / dt. Within a step of dt, a
+    torque u changes the speed w by u dt / J. J is the effective inertia between the wheel and the
+    rest of the free robot. The torque limits of the motor apply as well.
+    """
+
+
+class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
+    """Pulsed thrusters (k,) that realise the command of each sample by an impulse.
+
+    Fields of each thruster: the index of its input (`at`), whether it is on-off, its largest thrust
+    [N], its least impulse [N s] and the impulse of one step (`quantum`). The commanded impulse that
+    was not fired is `left` for the next sample. The thrust `level` acts until the step `end`.
+    `time` [s] is the sample time.
+    """
+
+
+class Channel(
+    namedtuple("Channel", "low high held pending slots sample delay fresh wheels pulses")
+):
+    """Limits (nu,) of commands, and the delayed commands `pending` (slots, nu), one per sample.
+
+    `delay` (1,) is in steps. `fresh` (1,) is 1 if a command begins to act in this step, else 0.
+    """
+
+
+WHEELS = Struct(Wheels, at=INDICES, row=INDICES)
+PULSES = Struct(Pulses, REALS, {LANED: "left level end"}, at=INDICES, on_off=FLAGS, time=REAL)
+_OF_CHANNEL = {WHOLE: "slots sample", LANED: "held pending delay fresh"}
+CHANNEL = Struct(Channel, REALS, _OF_CHANNEL, wheels=WHEELS, pulses=PULSES)
+
+
+def clipped(value, low, high):
+    """Return a number clipped to limits; NaN remains NaN."""
+    value = chosen(value, low, low, value)
+    return chosen(high, value, high, value)
+
+
+def limit(channel, u):
+    """Saturate inputs at their limits."""
+    for index in range(len(channel.low)):
+        value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
+        store(u, index, value)
+
+
+def is_asked(channel, step):
+    """Return whether the policy is evaluated at the start of a step."""
+    return channel.sample == 0 or step % channel.sample == 0
+
+
+def transmit(channel, step, nu, u):
+    """Replace the command u by the inputs that act in this step.
+
+    u is a new command only in steps in which the policy is evaluated (`is_asked`).
+    """
+    count = len(channel.low)
+    if is_asked(channel, step):
+        limit(channel, u)
+        if channel.sample > 0:
+            first = (step // channel.sample) % channel.slots * count
+            vec.copy(u, 0, channel.pending, first, count)
+    # Write the latest command that has arrived after the delay, or its pulses.
+    if channel.sample > 0:
+        any_fresh = False
+        for lane in range(vec.lane_count(channel.delay)):
+            since = step - int(vec.peek(channel.delay, 0, lane))
+            arrives = since >= 0 and since % channel.sample == 0
+            if arrives:
+                first = (since // channel.sample) % channel.slots * count
+                for index in range(count):
+                    value = vec.peek(channel.pending, first + index, lane)
+                    vec.poke(channel.held, index, lane, value)
+            fresh = arrives or (since < 0 and step % channel.sample == 0)
+            vec.poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
+            any_fresh = any_fresh or fresh
+        if any_fresh:
+            _begin_pulses(channel, step, channel.held)
+        vec.copy(channel.held, 0, u, 0, count)
+        pulses = channel.pulses
+        for index in range(len(pulses.at)):
+            level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
+            store(u, pulses.at[index], level)
+    # Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero.
+    wheels = channel.wheels
+    for index in range(len(wheels.at)):
+        least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
+        speed, stiffness = load(nu, wheels.row[index]), load(wheels.stiffness, index)
+        low = clipped(stiffness * (load(wheels.least_speed, index) - speed), least, most)
+        high = clipped(stiffness * (load(wheels.most_speed, index) - speed), least, most)
+        low, high = chosen(low, 0.0, low, 0.0), chosen(0.0, high, high, 0.0)
+        at = wheels.at[index]
+        store(u, at, clipped(load(u, at), low, high))
+
+
+def _begin_pulses(channel, step, u):
+    """Fire the pulse of a sample, and leave the remaining impulse to the next sample."""
+    pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
+    for index in range(len(pulses.at)):
+        most, least = load(pulses.most, index), load(pulses.least, index)
+        command = load(u, pulses.at[index])
+        wanted = chosen(most, command, most, command) * pulses.time + load(pulses.left, index)
+        if pulses.on_off[index]:
+            quantum = load(pulses.quantum, index)
+            length = clipped(whole(wanted / quantum), 0.0, float(sample))
+            level, fired = most + 0.0 * wanted, length * quantum
+        else:
+            level = clipped(wanted / pulses.time, 0.0, most)
+            length, fired = float(sample) + 0.0 * wanted, level * pulses.time
+        # An impulse that only rounding errors put below the least impulse is fired.
+        fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
+        left, end = wanted - fires * fired, float(step) + fires * length
+        store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
+        store(pulses.end, index, chosen(0.5, fresh, end, load(pulses.end, index)))
+        store(pulses.level, index, chosen(0.5, fresh, level, load(pulses.level, index)))
 
 
 class Method(namedtuple("Method", "h origin shift speed nodes weights moments")):
@@ -63,10 +185,8 @@ ARGUMENTS = Struct(
     point=POINT,
     stages=Struct(Stages, LANED),
 )
-_opened = Opener(ARGUMENTS)
 
 
-@inlined
 def _combine(shares, row, rates, out):
     """Write a combination of v and the accelerations of the stages."""
     size = len(out)
@@ -79,7 +199,6 @@ def _combine(shares, row, rates, out):
         store(out, index, total)
 
 
-@inlined
 def goes_on(stop, origin, q, rates):
     """Return whether all rates are within finite bounds and the base is within the chart."""
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
@@ -91,16 +210,6 @@ def goes_on(stop, origin, q, rates):
     return good
 
 
-@inlined
-def _decide(work, channel, law, robot, point, step, stage, t):
-    """Write the commanded inputs at a stage."""
-    if is_asked(channel, step):
-        command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
-        allocate(law.allocation, point, law.u)
-    transmit(channel, step, point.nu, point.u)
-
-
-@inlined
 def _move(robot, method, stages, point, stage):
     """Move the point from a stage with known acceleration to the next stage or the step's end."""
     rates, along = stages.rates, stages.along
@@ -125,7 +234,7 @@ def advance(words, clock, last, every, rows, work):
     is written every `every` steps: q, nu, u, and the reference of momentum (6,) and centre of mass
     (3,). `work` has `Layout.size` entries.
     """
-    of = _opened(words)
+    of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
     point, stages = of.point, of.stages
     h, at = method.h, 0  # `at` is the place of the next entry in `rows`
@@ -133,13 +242,15 @@ def advance(words, clock, last, every, rows, work):
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
     for step in range(clock[0], last):
-        forward.begin_step(kept)
         vec.copy(point.q, 0, stages.first, 0, len(point.q))
         vec.copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-                _decide(work, channel, law, robot, point, step, stage, t)
+                if is_asked(channel, step):
+                    command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
+                    allocate(law.allocation, point, law.u)
+                transmit(channel, step, point.nu, point.u)
             forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
             forward.turn_held(robot, point)
             if stage == 0:
@@ -160,8 +271,7 @@ def advance(words, clock, last, every, rows, work):
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
-        if of.pushed:
-            forward.end_step(kept, h)
+        forward.end_step(kept, h)
         if of.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
@@ -202,21 +312,17 @@ RUN_STATISTICS = Struct(
     settled=REAL,
     at=POINT,
 )
-_opened_statistics = Opener(RUN_STATISTICS)
 
 
-@inlined
 def _size(value):
     return chosen(value, 0.0, -value, value)
 
 
-@inlined
 def _grow(stats, index, value):
     """Replace an entry of the statistics by a value if the value is larger."""
     store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
-@inlined
 def _compare(stats, step):
     """Write the errors at a step, and the largest magnitude of each kind."""
     at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
@@ -248,7 +354,7 @@ def take(words, rows, first, count):
 
     `words` represent `RunStatistics`.
     """
-    stats = _opened_statistics(words)
+    stats = RUN_STATISTICS(words)
     at, sizes, kept = stats.at, stats.sizes, 0
     width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:

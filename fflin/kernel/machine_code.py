@@ -6,9 +6,9 @@ chain of ten calls would be compiled ten times. Here a part (a function called o
 functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
 Python calls.
 
-The operations of `kernel.lanes` are compiled for one number or for eight at once. An array with one
-axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and one
-instruction for all eight. A single double stands for eight equal numbers. So a function that is
+The operations of `kernel.vectors` are compiled for one number or for eight at once. An array with
+one axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and
+one instruction for all eight. A single double stands for eight equal numbers. So a function that is
 written for one number can be compiled for eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
@@ -21,6 +21,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
+from itertools import product
 from types import FunctionType, ModuleType
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -34,14 +35,14 @@ from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.datamodel import DataModelManager
 from numba.core.dispatcher import _CompileStats
-from numba.core.typing.context import BaseContext as TypingContext
-from numba.core.typing.templates import AttributeTemplate, Signature
+from numba.core.typing import BaseContext as TypingContext
+from numba.core.typing import Signature, make_concrete_template
+from numba.core.typing.templates import AttributeTemplate, infer_global
 from numba.np.arrayobj import populate_array
 from numba.types import Array, Type, boolean, float64, intp, void
 
-from fflin.kernel import lanes as uncompiled
-from fflin.kernel.arguments import Kind, Opener, Struct
-from fflin.kernel.tree import LANES
+from fflin.kernel import vectors as uncompiled
+from fflin.kernel.tree import LANES, Kind, Struct
 
 _DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)
@@ -92,44 +93,34 @@ def _together(*kinds: Type) -> Type:
     return lanes if lanes in kinds else float64
 
 
-def _arithmetic(python: Callable[..., object], generate: Generator) -> None:
+def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
     """Define an operator of Python for lanes, and for lanes with doubles."""
-
-    def typed(left: Type, right: Type) -> Type | None:
-        return lanes if _together(left, right) == lanes else None
 
     def lowered(
         _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
     ) -> ir.Value:
         return generate(builder, *_alike(builder, *values), flags=["contract"])
 
-    extending.type_callable(python)(lambda _: typed)
-    for kinds in (Lanes, Lanes), (Lanes, numba.types.Float), (numba.types.Float, Lanes):
-        extending.lower_builtin(python, *kinds)(lowered)
+    signatures = [lanes(*k) for k in product((lanes, float64), repeat=operands) if lanes in k]
+    infer_global(python)(make_concrete_template(python.__name__, python, signatures))
+    for signature in signatures:
+        extending.lower_builtin(python, *signature.args)(lowered)
 
 
 _arithmetic(operator.add, ir.IRBuilder.fadd)
 _arithmetic(operator.sub, ir.IRBuilder.fsub)
 _arithmetic(operator.mul, ir.IRBuilder.fmul)
 _arithmetic(operator.truediv, ir.IRBuilder.fdiv)
-extending.type_callable(operator.neg)(lambda _: lambda value: lanes if value == lanes else None)
+_arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 
-
-@extending.lower_builtin(operator.neg, Lanes)
-def _negative(
-    _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
-) -> ir.Value:
-    return builder.fneg(*values)
-
-
-# {function of `kernel.lanes`: operation that replaces it in compiled code}.
+# {function of `kernel.vectors`: operation that replaces it in compiled code}.
 OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Decorate a function that generates the code which replaces a function of `kernel.lanes`.
+    """Decorate a function that generates the code which replaces a function of `kernel.vectors`.
 
     The function gets an array as the address of its first entry, a double or a vector.
     """
@@ -375,7 +366,6 @@ def _field(
 def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
     """Return the numba function that interprets an array of words as a struct."""
 
-    @extending.intrinsic
     def opened(_: TypingContext, words: Array) -> tuple[Signature, Generator]:
         def generate(
             context: BaseContext, builder: ir.IRBuilder, _: Signature, values: Sequence[ir.Value]
@@ -384,8 +374,7 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
 
         return _StructType(kind)(words), generate
 
-    opened_function: Callable[..., object] = opened
-    return opened_function
+    return extending.intrinsic(opened)
 
 
 # A product and a sum may become one fused instruction, which rounds once. A division by zero gives
@@ -421,20 +410,18 @@ def translated(function: FunctionType) -> Compiled:
     twin = FunctionType(
         function.__code__, names, function.__name__, function.__defaults__, function.__closure__
     )
-    return _DECORATORS[uncompiled.HOW[function]](twin)
+    return _DECORATORS[uncompiled.HOW.get(function, "inlined")](twin)
 
 
 def _counterpart(value: object) -> object:
     """Return the value that compiled code uses in place of a global of a kernel module."""
-    if isinstance(value, Opener):
-        return opener(value.kind)
+    if isinstance(value, Struct):
+        return opener(value)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):
         return _translated_module(value)
-    if isinstance(value, FunctionType):
-        loop = uncompiled.LOOPS.get(value, value)
-        if isinstance(loop, FunctionType) and loop in uncompiled.HOW:
-            return translated(loop)
-    return OPERATIONS.get(value, value) if callable(value) else value
+    if callable(value):
+        value = OPERATIONS.get(value, uncompiled.LOOPS.get(value, value))
+    return translated(value) if isinstance(value, FunctionType) else value
 
 
 @cache

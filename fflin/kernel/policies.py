@@ -3,20 +3,16 @@
 All lanes have the same trajectory and the same gains of trajectory feedback.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
-from fflin.kernel.arguments import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.lanes import angle, called, chosen, inlined, load, splat, store, whole
-from fflin.kernel.tree import MOTION, PLACE
+from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
+from fflin.kernel.vectors import angle, called, chosen, load, splat, store, whole
 
 _NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
 
@@ -44,7 +40,6 @@ _OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
 PATH = Struct(Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT)
 
 
-@inlined
 def _cubic(coefficients, k, s, out):
     size = len(out)
     for index in range(size):
@@ -53,7 +48,6 @@ def _cubic(coefficients, k, s, out):
         out[index] = coefficients[at] + s * (coefficients[at + size] + s * value)
 
 
-@inlined
 def _latest(knots, time):
     """Return the index of the last knot at or before a time, 0 if the time is before all knots."""
     low, high = 0, len(knots)
@@ -66,7 +60,6 @@ def _latest(knots, time):
     return low
 
 
-@inlined
 def _placed(knots, time):
     """Return the index of the interval that contains a time, and its elapsed fraction."""
     last = len(knots) - 2
@@ -77,7 +70,6 @@ def _placed(knots, time):
     return k, 0.0 if s < _NEAR else min(s, 1.0)
 
 
-@inlined
 def _follow(robot, path, t):
     """Write the point of the trajectory at a time, with u in base axes.
 
@@ -108,7 +100,6 @@ def _follow(robot, path, t):
     return after
 
 
-@inlined
 def error(robot, path, point):
     """Write the error of a point from the followed point, in the axes of the followed point."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
@@ -130,7 +121,6 @@ def error(robot, path, point):
         store(e, 6 + n + index, load(point.nu, index) - load(there.nu, index))
 
 
-@inlined
 def track(robot, path, point, u, t):
     """Write the inputs u* - K e at the time t of the run."""
     after = _follow(robot, path, t)
@@ -157,14 +147,15 @@ NOTHING, LINEAR, TRACK = range(3)
 class Law(
     namedtuple(
         "Law",
-        "kind turned origin near grid filter measured gyros x y added u path allocation",
+        "kind turned origin near grid filter measured gyros gyro_axes x y added u path allocation",
     )
 ):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
     - `kind`: NOTHING; LINEAR, where u comes from y by `filter`, or by the gains of `grid` if it has
       joints; or TRACK, where u = u* - K e along `path`.
-    - `x`: the state, followed by the gyroscope outputs (`gyros`).
+    - `x`: the state, followed by the outputs of gyroscopes, which are on the bodies `gyros` (k,).
+      Their axes `gyro_axes` (9 k,) are columns in body axes.
     - `y` (ny,): the entries `measured` of x, plus a row of `added` (slots, ny). Each sample uses
       the next row, and the rows repeat.
     - `turned`: whether omega_b and v_b of the state are in reference axes.
@@ -181,10 +172,6 @@ class Grid(namedtuple("Grid", "joint first values stride K offset at")):
     The grid values of joint i are ``values[first[i]:first[i + 1]]``. From one grid value of joint i
     to the next, the index of the gain in `K` grows by ``stride[i]``. `at` (k,) is work space.
     """
-
-
-class Gyros(namedtuple("Gyros", "body axes")):
-    """Bodies (k,) with a gyroscope, and the gyroscopes' axes (9 k,) as columns in body axes."""
 
 
 class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
@@ -207,7 +194,7 @@ LAW = Struct(
     grid=Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED),
     filter=Struct(Filter, z=LANED, rates=LANED),
     measured=INDICES,
-    gyros=Struct(Gyros, body=INDICES),
+    gyros=INDICES,
     path=PATH,
     allocation=ALLOCATION,
 )
@@ -217,9 +204,8 @@ LAW = Struct(
 def read_state(robot, law, point, row):
     """Write the state of the linear model into `law.x`."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
-    position, turn = vec.get3(law.origin, 7 * row), vec.get3(law.origin, 7 * row + 3)
-    turn = turn, load(law.origin, 7 * row + 6)
-    vector, scalar = vec.quaternion_times(turn, (vec.get3(q, 3), load(q, 6)))
+    position, turn = vec.get3(law.origin, 7 * row), vec.attitude(law.origin, 7 * row)
+    vector, scalar = vec.quaternion_times(turn, vec.attitude(q))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
     vec.put3(x, 0, vec.times(vector, sign))
     vec.put3(x, 3, vec.plus(position, vec.product(vec.columns_of(turn), vec.get3(q, 0))))
@@ -238,23 +224,21 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
-@inlined
 def _measure(work, robot, law, point, count):
     """Write the outputs y of a sample, including its noise."""
     outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
-    if len(gyros.body) > 0:
+    if len(gyros) > 0:
         move_bodies(work, tree, point.nu)
-    for index in range(len(gyros.body)):
-        rate = vec.get3(work, tree.motion + gyros.body[index] * MOTION)
-        axes = vec.get_columns(work, tree.places + gyros.body[index] * PLACE)
-        rate = vec.across(vec.get_columns(gyros.axes, 9 * index), vec.across(axes, rate))
+    for index in range(len(gyros)):
+        rate = vec.get3(work, tree.motion + gyros[index] * MOTION)
+        axes = vec.get_columns(work, tree.places + gyros[index] * PLACE)
+        rate = vec.across(vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate))
         vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
         store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
 
 
-@inlined
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
     total, width = splat(x, 0.0), len(x)
@@ -263,7 +247,6 @@ def _times(matrix, row, x):
     return total
 
 
-@inlined
 def command(work, robot, law, point, t, count, stage):
     """Write the commands of a policy at sample number `count`, for one stage of a step."""
     if law.kind == TRACK:
@@ -278,7 +261,6 @@ def command(work, robot, law, point, t, count, stage):
         _filter(law.filter, law.y, law.u, row, stage)
 
 
-@inlined
 def _feed_back_between(robot, law, point):
     """Write the commands that the interpolated feedback laws of a grid give, lane by lane."""
     grid, y, u = law.grid, law.y, law.u
@@ -287,26 +269,23 @@ def _feed_back_between(robot, law, point):
         store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
     for index in range(inputs):
         store(u, index, 0.0)
-    for lane in range(lanes.width(u)):
+    for lane in range(vec.lane_count(u)):
         for corner in range(1 << len(grid.joint)):
             weight, cell = _corner(grid, corner, lane)
             for row in range(inputs if weight > 0.0 else 0):
                 at = cell * inputs + row
-                total = lanes.peek(grid.offset, at, lane)
+                total = vec.peek(grid.offset, at, lane)
                 for column in range(size):
-                    total -= lanes.peek(grid.K, at * size + column, lane) * lanes.peek(
-                        y, column, lane
-                    )
-                lanes.poke(u, row, lane, lanes.peek(u, row, lane) + weight * total)
+                    total -= vec.peek(grid.K, at * size + column, lane) * vec.peek(y, column, lane)
+                vec.poke(u, row, lane, vec.peek(u, row, lane) + weight * total)
 
 
-@inlined
 def _corner(grid, corner, lane):
     """Return a corner of a lane's grid cell as its interpolation weight and its gain's index."""
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1
-        value = min(max(lanes.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
+        value = min(max(vec.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
         k = first
         while k < last - 1 and value >= grid.values[k + 1]:
             k += 1

@@ -1,4 +1,9 @@
-"""Vectors (3), spatial vectors, attitudes and displacements; entries are numbers or lanes.
+"""Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
+
+A function of the kernel is a Python function. Called directly, with arrays or lists of one axis, it
+computes one number at a time. The Python engine calls it like this, and a debugger can step through
+it. `kernel.machine_code` compiles the same function, also for arrays with a second axis of eight
+lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
@@ -7,22 +12,94 @@ joints.
 
 from __future__ import annotations
 
-from math import factorial
+import math
+from collections.abc import Callable
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from fflin.kernel.lanes import floor, inlined, load, store
+from fflin.base.validation import Array
 
 _TERMS = 10  # exact to machine precision up to half a turn; a step rotates by less than a radian
 
+F = TypeVar("F", bound=Callable[..., object])
 
-@inlined
+# One number; in compiled code also eight lanes.
+Number: TypeAlias = float
+# Numbers in memory. The entries of a list are read faster than the entries of an array.
+Entries: TypeAlias = Array | list[Number]
+
+# {function of the kernel: how it is compiled}. All other functions are inlined in their callers.
+HOW: dict[Callable[..., object], str] = {}
+# {function that uses NumPy: loop that is compiled in its place}.
+LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
+
+
+def _decorator(how: str) -> Callable[[F], F]:
+    def noted(function: F) -> F:
+        HOW[function] = how
+        return function
+
+    return noted
+
+
+# For functions that are rarely called: inlining saves little there, and takes long to compile.
+called = _decorator("called")
+# For functions called from Python; their machine code is stored on disk.
+compiled = _decorator("compiled")
+
+floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
+
+
+def load(array: Entries, index: int) -> Number:
+    """Return an entry of an array: one number, or one number per lane."""
+    return array[index]
+
+
+def store(array: Entries, index: int, value: Number) -> None:
+    """Write a number or lanes at an index."""
+    array[index] = value
+
+
+def splat(array: Entries, value: float) -> Number:
+    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
+    return value
+
+
+def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
+    """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
+    return less if left < right else other
+
+
+def below(value: Number, bound: Number) -> bool:
+    """Return whether a number, or every lane, is less than a bound; false for NaN."""
+    return value < bound
+
+
+def peek(array: Array, index: int, lane: int) -> float:
+    """Return the value of a lane at an index."""
+    value: float = array[index] if array.ndim == 1 else array[index, lane]
+    return value
+
+
+def poke(array: Array, index: int, lane: int, value: float) -> None:
+    """Write the value of a lane at an index."""
+    if array.ndim == 1:
+        array[index] = value
+    else:
+        array[index, lane] = value
+
+
+def lane_count(array: Array) -> int:
+    """Return the number of lanes of an array, 0 if the array is empty."""
+    return array.size // max(len(array), 1)
+
+
 def get3(work, at):
     """Read a vector."""
     return load(work, at), load(work, at + 1), load(work, at + 2)
 
 
-@inlined
 def put3(work, at, a):
     """Write a vector."""
     store(work, at, a[0])
@@ -30,20 +107,17 @@ def put3(work, at, a):
     store(work, at + 2, a[2])
 
 
-@inlined
 def copy(source, first, target, to, count):
     """Copy entries."""
     for index in range(count):
         store(target, to + index, load(source, first + index))
 
 
-@inlined
 def add(work, at, value):
     """Add to an entry."""
     store(work, at, load(work, at) + value)
 
 
-@inlined
 def add3(work, at, a):
     """Add to a vector."""
     add(work, at, a[0])
@@ -51,99 +125,83 @@ def add3(work, at, a):
     add(work, at + 2, a[2])
 
 
-@inlined
 def get6(work, at):
     """Read a spatial vector."""
     return get3(work, at), get3(work, at + 3)
 
 
-@inlined
 def put6(work, at, s):
     """Write a spatial vector."""
     put3(work, at, s[0])
     put3(work, at + 3, s[1])
 
 
-@inlined
 def add6(work, at, s):
     """Add to a spatial vector."""
     add3(work, at, s[0])
     add3(work, at + 3, s[1])
 
 
-@inlined
 def get_columns(work, at):
     """Read a matrix of three columns."""
     return get3(work, at), get3(work, at + 3), get3(work, at + 6)
 
 
-@inlined
 def cross(a, b):
     """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inlined
 def dot(a, b):
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
 def plus(a, b):
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@inlined
 def minus(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inlined
 def times(a, value):
     """Return a vector times a number."""
     return a[0] * value, a[1] * value, a[2] * value
 
 
-@inlined
 def product(columns, a):
     """Return a matrix, given by its columns, times a vector."""
     return plus(plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2]))
 
 
-@inlined
 def across(columns, a):
     """Return the transpose of a matrix, given by its columns, times a vector."""
     return dot(columns[0], a), dot(columns[1], a), dot(columns[2], a)
 
 
-@inlined
 def dot6(s, t):
     """Return the scalar product of a motion vector and a force vector, in either order."""
     return dot(s[0], t[0]) + dot(s[1], t[1])
 
 
-@inlined
 def plus6(s, t):
     """Return s + t of spatial vectors."""
     return plus(s[0], t[0]), plus(s[1], t[1])
 
 
-@inlined
 def minus6(s, t):
     """Return s - t of spatial vectors."""
     return minus(s[0], t[0]), minus(s[1], t[1])
 
 
-@inlined
 def times6(s, value):
     """Return a spatial vector times a number."""
     return times(s[0], value), times(s[1], value)
 
 
-@inlined
 def cosine_and_sine(x):
     """Return the cosine and sine of |x| < 1e6, accurate to one unit in the last place.
 
@@ -177,10 +235,11 @@ def cosine_and_sine(x):
 
 def _series(first):
     """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
-    shares = [(-1) ** k * factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
+    shares = [
+        (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k) for k in range(_TERMS)
+    ]
     last, rest = shares[-1], tuple(shares[-2::-1])
 
-    @inlined
     def series(x):
         total = rest[0] + x * last
         for share in rest[1:]:
@@ -193,7 +252,6 @@ def _series(first):
 _cosine, _sine, _sixth = _series(0), _series(1), _series(3)
 
 
-@inlined
 def quaternion_times(a, b):
     """Return the product of quaternions, each given as ((x, y, z), w)."""
     v, w = a
@@ -202,7 +260,6 @@ def quaternion_times(a, b):
     return vector, w * scalar - dot(v, other)
 
 
-@inlined
 def columns_of(quaternion):
     """Return the columns of a unit quaternion's rotation matrix."""
     (x, y, z), w = quaternion
@@ -216,19 +273,16 @@ def columns_of(quaternion):
     )
 
 
-@inlined
-def attitude(q):
-    """Return the base's quaternion at a configuration."""
-    return get3(q, 3), load(q, 6)
+def attitude(q, at=0):
+    """Return the base's quaternion at a configuration, which begins at an index."""
+    return get3(q, at + 3), load(q, at + 6)
 
 
-@inlined
 def axes_of(q):
     """Return the base's axes in the world."""
     return columns_of(attitude(q))
 
 
-@inlined
 def displace(tree, q, along, out):
     """Write q displaced along a tangent vector; the base moves by the exponential map."""
     w, v = get3(along, 0), get3(along, 3)

@@ -106,23 +106,23 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
 
 
 def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
-    """Return {joint: value} of all joints except wheels and modes, where names are exact."""
-    found = numbers(what, value, "joint", f"{what} of joint")
-    return by_joint(found, robot.own_joints, robot.joint)
+    """Return the stiffness, damping or rest positions {joint: value}.
 
-
-def _coefficients(what: str, value: object, robot: Robot) -> dict[str, float]:
-    """Return the stiffness or damping {joint: value} from a mapping, one value or "urdf"."""
-    if isinstance(value, str) and what == "damping":
+    Stiffness and damping may be one value for all joints except wheels and modes, whose names must
+    be exact; damping may be "urdf".
+    """
+    if what == "damping" and isinstance(value, str):
         if value != "urdf":
             raise InputError(
                 f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}"
             )
         return dict(robot.urdf_damping)
-    many = value if isinstance(value, Mapping) else dict.fromkeys(robot.own_joints, value)
-    found = _of_joints(what, many, robot)
+    if what != "rest" and not isinstance(value, Mapping):
+        value = dict.fromkeys(robot.own_joints, value)
+    values = numbers(what, value, "joint", f"{what} of joint")
+    found = by_joint(values, robot.own_joints, robot.joint)
     for name, entry in found.items():
-        if entry < 0.0:
+        if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
     return found
 
@@ -203,9 +203,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 FIELDS: dict[str, Callable[[object, Robot], Any]] = {
     **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
     "outputs": _outputs,
-    "stiffness": partial(_coefficients, "stiffness"),
-    "damping": partial(_coefficients, "damping"),
-    "rest": partial(_of_joints, "rest"),
+    **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),
     "orbit": lambda value, _: checked_orbit(value),
     "limits": lambda value, robot: given_limits(robot.inputs, robot.joint_names, value),

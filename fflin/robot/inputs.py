@@ -1,7 +1,6 @@
 """Inputs u of the linear model: forces and torques on a robot, in any mix and order."""
 
 import math
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -64,30 +63,6 @@ class Input:
         frame: str | None = getattr(self, "frame", None)
         return () if frame is None else (frame,)
 
-    def names(self, count: int) -> tuple[str, ...]:
-        """Return the names of this input's entries in u.
-
-        `count` numbers the inputs of one type; the default names of thrusters and wheels contain
-        this number.
-        """
-        return tuple(map(f"{self.GROUP}.{{}}".format, self.ENTRIES))
-
-
-class WrenchInput(Input, ABC):
-    """Base class of inputs whose wrench on a link is constant in a frame."""
-
-    frame: str | None  # frame of the model on any link; None for the base's root frame
-    name: str | None
-
-    def names(self, count: int) -> tuple[str, ...]:
-        """Return the input's name in u: the given name, or a default such as thruster_1."""
-        return (self.name or f"{self.KEY.rpartition('_')[2]}_{count}",)
-
-    @property
-    @abstractmethod
-    def wrench(self) -> Array:
-        """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
-
 
 class BaseTorque(Input):
     """Torque tau_b (3,) [N m] on the base, in the axes that `frame` of `linearize` selects.
@@ -147,13 +122,9 @@ class JointTorque(Input):
     KEY, GROUP = "joint_torque", "tau_m"
     joint: str
 
-    def names(self, count: int) -> tuple[str, ...]:
-        """Return the input's name in u, which is ``tau_m.JOINT``."""
-        return (f"{self.GROUP}.{self.joint}",)
-
 
 @dataclass(frozen=True)
-class Thruster(WrenchInput):
+class Thruster(Input):
     """Force [N] of a thruster, with its point of action and direction fixed in a frame.
 
     Parameters
@@ -216,7 +187,7 @@ class Thruster(WrenchInput):
 
 
 @dataclass(frozen=True)
-class ReactionWheel(WrenchInput):
+class ReactionWheel(Input):
     r"""Motor torque [N m] of a balanced reaction wheel, whose axis is fixed on a link.
 
     The link that carries the wheel is called the carrier. The motor exerts the torque u about the
@@ -318,12 +289,20 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
-    """Return (input, names of its entries in u) for each input."""
+    """Return (input, names of its entries in u) for each input.
+
+    The default names of thrusters and wheels are thruster_1, ... and wheel_1, ...
+    """
     seen: Counter[str] = Counter()
     found = []
     for item in inputs:
         seen[item.GROUP] += 1
-        found.append((item, item.names(seen[item.GROUP])))
+        if isinstance(item, Thruster | ReactionWheel):
+            names = [item.name or f"{item.KEY.rpartition('_')[2]}_{seen[item.GROUP]}"]
+        else:
+            entries = [item.joint] if isinstance(item, JointTorque) else item.ENTRIES
+            names = [f"{item.GROUP}.{entry}" for entry in entries]
+        found.append((item, tuple(names)))
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
@@ -94,10 +95,6 @@ class Follower(NamedTuple):
     multiplier: float
     offset: float
 
-    def place(self, q: Array) -> None:
-        """Write the mimic joint's value, which follows from its leader's value, into q (nq,)."""
-        self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
-
     def within(self, model: pin.Model) -> Follower:
         """Return this mimic joint with the indices of its joints in another model."""
         return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
@@ -147,15 +144,19 @@ def find_joint(model: pin.Model, name: str) -> Carried:
     return Carried(frame.parentJoint, pin.SE3(frame.placement))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Coordinates:
     """Configuration q and velocity v of a robot, and checks of given values."""
 
     model: pin.Model
     name: str
     joints: tuple[Joint, ...]
-    followers: tuple[Follower, ...]
-    _as_made: tuple[pin.Model, pin.Model] | None
-    _removed: tuple[str, ...]
+    followers: tuple[Follower, ...] = ()
+    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
+    _removed: tuple[str, ...] = ()
+    # The model, and a copy of it. The copy shows whether the model has changed since it was
+    # copied.
+    _as_made: tuple[pin.Model, pin.Model] | None = None
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -186,14 +187,13 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        for follower in self.followers:
-            follower.place(q)
+        self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:
         """Write the values of mimic joints, which follow their leaders, into q (nq,)."""
-        for follower in self.followers:
-            follower.place(q)
+        for joint, leader, multiplier, offset in self.followers:
+            joint.place(q, multiplier * leader.value(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""

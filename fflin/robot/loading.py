@@ -1,24 +1,47 @@
-"""Robots loaded from a file, or made from a Pinocchio model that was built by other means."""
+"""Robots loaded from a URDF or robot file, or made from a Pinocchio model.
+
+A robot file is a TOML file that names a URDF and gives its inputs, outputs and other fields.
+"""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, ModelError
+from fflin.base.errors import FflinWarning, InputError, ModelError, UnknownNameError, unknown
+from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import instance, is_rotation
 from fflin.base.writing import remember
-from fflin.robot.catalog import find_mesh, find_robot, folders
+from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
+from fflin.robot.fields import FIELDS
+from fflin.robot.inputs import KINDS, Input
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic, is_impossible
 from fflin.robot.urdf.reader import read_urdf
 from fflin.robot.welding import Lock, locked_model, requested, welded
+
+T = TypeVar("T")
+
+# Fields that a TOML file writes as arrays of tables ([[input]]): {field: names of the arrays}.
+_TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
+
+# Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
+KEYS = (
+    *("urdf", "package_dirs", "lock"),
+    *(table for tables in _TABLES.values() for table in tables),
+    *(name for name in FIELDS if name not in _TABLES),
+)
+
+_TYPES = {kind.KEY: kind for kind in KINDS}
 
 
 def load(
@@ -79,21 +102,18 @@ def load(
     >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
     8
     """
-    found, dirs = find_robot(robot), folders(package_dirs)
-    first = None if lock is None else requested(lock)
-    later: dict[str, float | None] = {}
-    file = None
+    found, dirs, locks = (
+        find_robot(robot),
+        folders(package_dirs),
+        requested(() if lock is None else lock),
+    )
+    document, later, of_file = None, dict[str, float | None](), dict[str, object]()
     if found.path.suffix.lower() == ".toml":
-        from fflin.robot.robot_files import RobotToml
-
-        file = RobotToml(found.path, found.name)
-        later, first = first or {}, None
-        found, dirs = file.found, (*dirs, *file.package_dirs)
-        if file.lock:
-            first = {name: later.pop(name, value) for name, value in file.lock.items()}
+        document, found, own, of_file = _read_robot_file(found)
+        later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
     urdf = read_urdf(found.path)
-    with file.document.located("lock") if file and first else nullcontext():
-        loaded = _robot(urdf.model, found.name, first, urdf.mimics)
+    with document.located("lock") if document else nullcontext():
+        loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
     # Meshes are read only when the robot is drawn, so output files must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
@@ -116,8 +136,11 @@ def load(
         },
         file_joints=tuple(urdf.joints),
     )
-    if file:
-        loaded = file.applied(loaded)
+    for key, value in of_file.items():
+        assert document is not None
+        tables = _TABLES.get(key, (key,))
+        with document.located(next(x for x in tables if x in document.record)):
+            loaded = loaded.replace(**{key: value})
     if later:
         loaded = welded(loaded, later)
     loaded = loaded.merged(fields)
@@ -185,13 +208,13 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     _check_model(copy, name)
-    robot = _robot(copy, name, lock, {})
+    robot = _robot(copy, name, requested(() if lock is None else lock), {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
 
 
-def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
+def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
     """Make a robot of a model, which must be one depth-first tree on one free-flyer."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
@@ -207,7 +230,7 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
         )
     require_room(model, name)
     locked: tuple[str, ...] = ()
-    if lock is not None:
+    if lock:
         model, mimics, locked = locked_model(model, lock, mimics)
     all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
@@ -216,18 +239,13 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
         Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
         for joint, mimic in mimics.items()
     )
-    above: list[int] = []
-    for joint, parent in enumerate(model.parents.tolist()):
-        while above and above[-1] != parent:
-            above.pop()
-        if joint and not above:
-            raise ModelError(
-                f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA "
-                "gives wrong results; add all joints of one branch before the joints of the "
-                "next branch"
-            )
-        above.append(joint)
-    return Robot(model, name, None, "", joints, followers, locked=locked)
+    # In depth-first order, the indices of each subtree have no gaps.
+    if any(subtree[len(subtree) - 1] - subtree[0] >= len(subtree) for subtree in model.subtrees):
+        raise ModelError(
+            f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA gives "
+            "wrong results; add all joints of one branch before the joints of the next branch"
+        )
+    return Robot(model, name, joints, followers, locked=locked)
 
 
 def _check_model(model: pin.Model, name: str) -> None:
@@ -263,3 +281,180 @@ def body_alone(payload: pin.Inertia, name: str) -> Robot:
     model.appendBodyToJoint(1, inertia, pin.SE3.Identity())
     model.addJointFrame(1)
     return from_model(model, name=name)
+
+
+def load_inputs(path: str | Path) -> tuple[Input, ...]:
+    """Read the inputs of a robot from a TOML file.
+
+    The file is an array of tables ``[[input]]``, one table per input, in the order of u. In each
+    table, ``type`` selects the class of the input. The other keys are the parameters of this class:
+
+    ==================  ===============  =========================================
+    ``type``            class            keys
+    ==================  ===============  =========================================
+    ``base_torque``     `BaseTorque`     no other keys
+    ``base_force``      `BaseForce`      no other keys
+    ``joint_torque``    `JointTorque`    ``joint``
+    ``thruster``        `Thruster`       ``frame``, ``position`` [m] and
+                                         ``direction``; optional: ``name``,
+                                         ``on_off``, ``least_impulse`` [N s]
+    ``reaction_wheel``  `ReactionWheel`  ``axis``; optional: ``frame``, ``name``,
+                                         and either ``inertia`` [kg m^2] with
+                                         ``max_speed`` [rad/s], or ``momentum``
+                                         [N m s]
+    ==================  ===============  =========================================
+
+    Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
+    input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
+    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the file, or the name of a bundled file: ``"cubesat"`` or ``"servicer_7dof"``.
+
+    Returns
+    -------
+    tuple of Input
+
+    Raises
+    ------
+    FileError
+        If the path is not a regular file, or the file cannot be read or is too large.
+    UnknownNameError
+        If a type or key is unknown; the message names the file and line.
+    InputError
+        If the file is not TOML, a key is missing or a value is wrong; the message names the file
+        and line.
+
+    Examples
+    --------
+    A file with this content ::
+
+        [[input]]
+        type = "joint_torque"
+        joint = "joint_1"
+
+        [[input]]
+        type = "thruster"
+        name = "nozzle"
+        frame = "base"
+        position = [-0.9, 0.0, 0.65]
+        direction = [1, 0, 0]
+
+    gives the inputs
+    ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
+
+    >>> inputs = fflin.load_inputs("cubesat")  # bundled
+    >>> len(inputs), inputs[-1].name
+    (15, 'wheel_z')
+    """
+    return _read_inputs(_document(find_inputs(path)))
+
+
+def _document(path: Path) -> TomlFile:
+    """Return a file of inputs or a robot file, or raise `UnknownNameError` for an unknown key."""
+    document = TomlFile(path)
+    for key in document.record:
+        if key not in KEYS:
+            raise document.error(unknown("key of a robot file", key, KEYS), key)
+    return document
+
+
+def _read_robot_file(
+    file: RobotFile,
+) -> tuple[TomlFile, RobotFile, dict[str, float | None], dict[str, object]]:
+    """Return a robot file, its URDF, the joints that it locks, and its fields in order."""
+    document = _document(file.path)
+    record, folder = document.record, file.path.parent
+    if "urdf" not in record:
+        raise InputError(
+            f'{file.path}: the key `urdf` is missing; add urdf = "my.urdf", or pass a file that '
+            "contains only inputs with --inputs or fflin.load_inputs"
+        )
+    with document.located("urdf"):
+        found = find_robot(record["urdf"], folder)
+        if found.path.suffix.lower() == ".toml":
+            raise InputError(f"urdf is {found.path}, expected a URDF or a robot's name")
+    with document.located("package_dirs"):
+        dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
+    # Nested tables become names with dots, except for the parts of weights and states.
+    values = {
+        key: {part: flat(x) for part, x in value.items()}
+        if key in ("weights", "point", "target", "start") and isinstance(value, dict)
+        else flat(value)
+        for key, value in record.items()
+    }
+    with document.located("lock"):
+        lock = requested(values.get("lock", ()))
+    if "input" in record:
+        values["inputs"] = _read_inputs(document)
+    if appendages := _read_appendages(document):
+        values["appendages"] = appendages
+    # The robot has the name of the TOML file, not of the URDF.
+    found = found._replace(name=file.name, package_dirs=dirs)
+    return document, found, lock, {key: values[key] for key in FIELDS if key in values}
+
+
+def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
+    """Return the inputs of a file; see `load_inputs`."""
+    inputs: list[Input] = []
+    for index, table in enumerate(_tables(document, "input")):
+        kind, values = str(table.get("type")), {**table}
+        if "type" not in table:
+            problem = f"input {index + 1}: the key 'type' is missing; set 'type' to one of "
+            raise document.error(problem + ", ".join(_TYPES), "input", index)
+        if kind not in _TYPES:
+            problem = f"input {index + 1}: no valid 'type': {unknown('type', kind, _TYPES)}"
+            raise document.error(UnknownNameError(problem), "input", index, "type")
+        del values["type"]
+        inputs.append(_built(document, ("input", index), _TYPES[kind], values))
+    if not inputs:
+        message = "the file contains no inputs; add a table [[input]] with its type"
+        raise InputError(f"{document.path}: {message}")
+    return tuple(inputs)
+
+
+def _read_appendages(document: TomlFile) -> list[Appendage]:
+    found: list[Appendage] = []
+    for key, make, special in (
+        ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
+        ("slosh", Slosh, Slosh.cylinder),
+    ):
+        # These keys are valid only for a Nastran file, or only for a cylinder.
+        alone = set(signature(special).parameters) - set(signature(make).parameters)
+        for index, table in enumerate(_tables(document, key)):
+            values = {**table}
+            for name in {"op4", "asm"} & set(values):
+                values[name] = document.path.parent / str(values[name])
+            build: Callable[..., Appendage] = special if alone & set(values) else make
+            found.append(_built(document, (key, index), build, values))
+    return found
+
+
+def _tables(document: TomlFile, key: str) -> list[dict[str, object]]:
+    """Return an array of tables of a file, empty if there is none."""
+    tables = document.record.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+        raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
+    return tables
+
+
+def _built(
+    document: TomlFile, table: tuple[str, int], build: Callable[..., T], values: dict[str, object]
+) -> T:
+    """Build an object from a table; errors begin with file and line."""
+    of, parameters = f"{table[0]} {table[1] + 1}: ", dict(signature(build).parameters)
+    if isinstance(name := values.get("name"), str):
+        of = of.replace(":", f" ('{name}'):")
+    if build is FlexibleAppendage:  # these parameters come only from Nastran files
+        del parameters["inertia"], parameters["rigid"]
+    for name in values:
+        if name not in parameters:
+            problem = f"{of}{unknown(f'key of {table[0]}', name, parameters)}"
+            raise document.error(UnknownNameError(problem), *table, name)
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and name not in values:
+            raise document.error(f"{of}the key '{name}' is missing; add this key", *table)
+    with document.located(*table, of=of):
+        return build(**values)

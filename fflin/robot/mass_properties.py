@@ -11,7 +11,7 @@ physically-consistent inertial parameter identification, IEEE Robotics and Autom
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -53,18 +53,16 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint: body} from the argument of `Robot.with_mass_properties`."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
-    links: dict[int, list[str]] = {}
+    first_link, links = len(index_of), dict[int, list[str]]()
     for frame in model.frames.tolist():
         if frame.type == pin.FrameType.BODY and frame.name not in index_of:
+            index_of[frame.name] = frame.parentJoint
             links.setdefault(frame.parentJoint, []).append(frame.name)
-    several = {name: index for index, many in links.items() if many[1:] for name in many}
-    index_of |= {many[0]: index for index, many in links.items() if not many[1:]}
-    names, done, new = [*index_of, *several], dict[int, object](), dict[int, pin.Inertia]()
+    names, done, new = [*index_of], dict[int, object](), dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
-        name = names[place]
-        index = {**several, **index_of}[name]
-        body = "base" if index == ROOT else model.names[index]
-        if name in several or done.setdefault(index, value) is not value:
+        name, index = names[place], index_of[names[place]]
+        body, part = "base" if index == ROOT else model.names[index], place >= first_link
+        if (part and links[index][1:]) or done.setdefault(index, value) is not value:
             raise InputError(
                 f"'{name}' is part of the body '{body}' with the links "
                 f"{listed(links.get(index, [name]))}; give the properties of the whole body "
@@ -120,7 +118,7 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
             density, com = checked["mass"] * drawn[:, 0], checked["com"] * drawn[:, 1:4] * radii
             wider = checked["inertia"] * drawn[:, 4:]
-            mass, com, about = _properties(_stretched(body, np.eye(3), density, com, wider))
+            mass, com, about = properties(_stretched(body, np.eye(3), density, com, wider))
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
 
@@ -146,7 +144,7 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     return (1.0 + density)[:, None, None] * (T @ P @ T.swapaxes(1, 2))
 
 
-def _properties(P: Array) -> tuple[Array, Array, Array]:
+def properties(P: Array) -> tuple[Array, Array, Array]:
     """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of pseudo-inertias (N, 4, 4)."""
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
@@ -174,17 +172,15 @@ class Piece(NamedTuple):
     whole: bool = False  # whether the piece is a body of several links
 
 
-def pieces_of(
-    model: pin.Model, links: Mapping[str, LinkMass]
-) -> tuple[dict[str, Piece], dict[str, str]]:
+def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
     """Return {name: piece} and {body: link}.
 
     The pieces are all links, and all bodies of several links. A body of one link is given by the
     name of this link.
     """
-    found, also = dict[str, Piece](), dict[str, str]()
+    model, found, also = robot._bare.model, dict[str, Piece](), dict[str, str]()
     of_body: dict[int, dict[str, Piece]] = {}
-    for name, link in links.items():
+    for name, link in robot.links.items():
         if model.existFrame(name, pin.FrameType.BODY):
             joint, at = find_frame(model, name)
             piece = Piece(joint, at * link.placement, link.mass, link.inertia, at)
@@ -203,7 +199,10 @@ def pieces_of(
         alone = next(iter(named)) if len(named) == 1 else own
         also |= {own: alone} if alone != own else {}
         found.setdefault(alone, whole)
-    return found, also
+    # Wheels are inserted between the joints, so the joints' indices differ from the bare robot's.
+    now = [robot.model.getJointId(name) for name in model.names]
+    now[ROOT] = ROOT
+    return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}, also
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
@@ -240,11 +239,6 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     center = np.concatenate((body.lever + com @ piece.frame.rotation.T, np.ones((len(com), 1))), 1)
     added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
     return after + added - body.toPseudoInertia().toMatrix()
-
-
-def with_changed(body: pin.Inertia, changes: Iterable[Array]) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of a body with changed links."""
-    return _properties(body.toPseudoInertia().toMatrix() + sum(changes))
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from fflin.robot.equipment.assembly import equipped, with_appendages
 from fflin.robot.equipment.mounting import stored_momentum
 from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
-from fflin.robot.joints import ROOT, Coordinates, Follower, Joint, find_frame
+from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
 from fflin.robot.mass_properties import (
     LinkMass,
     Piece,
@@ -122,12 +122,8 @@ class Robot(Coordinates):
     (3, 50.0, 972)
     """
 
-    model: pin.Model
-    name: str
-    urdf: Path | None
-    urdf_sha256: str
-    joints: tuple[Joint, ...]
-    followers: tuple[Follower, ...] = ()
+    urdf: Path | None = None
+    urdf_sha256: str = ""
     notes: tuple[str, ...] = ()
     locked: tuple[str, ...] = ()
     urdf_damping: Mapping[str, float] = field(default_factory=dict)
@@ -151,11 +147,6 @@ class Robot(Coordinates):
     appendages: tuple[Appendage, ...] = ()
     # The same robot without wheels and modes; None if no joint is a wheel or mode.
     _unequipped: Robot | None = None
-    # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
-    _removed: tuple[str, ...] = ()
-    # The model, and a copy of it. The copy shows whether the model has changed since it was
-    # copied.
-    _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
         if self._as_made is None or self._as_made[0] is not self.model:
@@ -368,24 +359,17 @@ class Robot(Coordinates):
                 return changed
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
-    @cached_property
+    @property
     def pieces(self) -> dict[str, Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        # Wheels are inserted between the joints, so the joints' indices differ from the bare
-        # robot's.
-        names, at = self._bare.model.names, self.model.getJointId
-        now = [at(name) if joint > ROOT else joint for joint, name in enumerate(names)]
-        found = self._links_and_bodies[0]
-        return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
+        return self._links_and_bodies[0]
 
     @property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
         return self._links_and_bodies[1]
 
-    @cached_property
-    def _links_and_bodies(self) -> tuple[dict[str, Piece], dict[str, str]]:
-        return pieces_of(self._bare.model, self.links)
+    _links_and_bodies = cached_property(pieces_of)
 
     @property
     def used_frames(self) -> tuple[str, ...]:

@@ -127,7 +127,11 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     """
     bare = robot._bare
     joint, at = find_frame(bare.model, frame)
-    _require_new_names(robot, prefix)
+    if not prefix or "." in prefix:
+        raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
+    taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
+    if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
+        raise InputError(f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix")
     model = _joined(bare.model, joint, other.model.copy(), at * placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
@@ -159,14 +163,6 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     )
     name, attached = f"{robot.name}+{other.name}", (*robot.attached, (prefix, other))
     return equipped(replace(robot, name=name, attached=attached, **both), bare)
-
-
-def _require_new_names(robot: Robot, prefix: str) -> None:
-    if not prefix or "." in prefix:
-        raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
-    taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
-    if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
-        raise InputError(f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix")
 
 
 def _joined(

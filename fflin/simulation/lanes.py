@@ -21,9 +21,8 @@ from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, d
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
-from fflin.kernel.arguments import empty, laid_out, words_of
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree, work_space
+from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, words_of, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan, Times
@@ -434,10 +433,8 @@ def _filtered(
         near=np.concatenate([x[state.groups.q_m] for x in near]),
         filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=measured,
-        gyros=policies.Gyros(
-            [frame.joint - ROOT for frame in frames],
-            np.array([turn.ravel("F") for turn in turns]).ravel(),
-        ),
+        gyros=[frame.joint - ROOT for frame in frames],
+        gyro_axes=np.array([turn.ravel("F") for turn in turns]).ravel(),
         x=np.zeros(state.nx + 3 * len(gyros)),
     )
 

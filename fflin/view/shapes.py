@@ -18,13 +18,13 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinError
 from fflin.base.validation import Array
-from fflin.base.writing import reason, shown
+from fflin.base.writing import read_file, reason, shown
 from fflin.robot.catalog import find_mesh
 from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
 from fflin.robot.joints import ROOT, find_frame, find_joint
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import read_pose
-from fflin.robot.urdf.reader import plain_root, read_document
+from fflin.robot.urdf.reader import SIZE_LIMIT, plain_root
 from fflin.robot.urdf.xml import Element, named
 
 # Colour of a shape without a colour in the URDF.
@@ -73,7 +73,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     path = robot.urdf
     assert path is not None
     try:
-        root, _ = plain_root(read_document(path), path)
+        root, _ = plain_root(read_file(path, "URDF", SIZE_LIMIT), path)
     except FflinError as error:
         notes.append(f"no visual geometry: {error}")
         return

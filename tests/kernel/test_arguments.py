@@ -9,7 +9,8 @@ pytest.importorskip("numba")
 
 import numba
 
-from fflin.kernel.arguments import (
+from fflin.kernel.machine_code import PartLibrary, opener, translated
+from fflin.kernel.tree import (
     FLAG,
     FLAGS,
     INDICES,
@@ -22,8 +23,7 @@ from fflin.kernel.arguments import (
     laid_out,
     words_of,
 )
-from fflin.kernel.lanes import called, inlined
-from fflin.kernel.machine_code import PartLibrary, opener, translated
+from fflin.kernel.vectors import called
 
 pytestmark = pytest.mark.compiled
 
@@ -110,7 +110,6 @@ def square(x):
     return x * x + 1.0
 
 
-@inlined
 def twice(x):
     return 2.0 * square(x)
 

@@ -11,7 +11,7 @@ import pytest
 
 import fflin
 from fflin.robot.catalog import bundled_directory
-from fflin.robot.robot_files import KEYS
+from fflin.robot.loading import KEYS
 from tests.support.messages import says
 from tests.support.robots import BUNDLED
 

@@ -22,7 +22,7 @@ from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
 
-from fflin.kernel import arguments, channel
+from fflin.kernel import loop, tree
 
 pytestmark = pytest.mark.compiled
 
@@ -360,13 +360,13 @@ class Kept(lanes.Statistics):
 
 
 def test_arguments_are_laid_out_or_refused():
-    given = channel.Wheels(*(np.array([k]) for k in range(7)))
-    wheels = arguments.laid_out(given, channel.WHEELS)
+    given = loop.Wheels(*(np.array([k]) for k in range(7)))
+    wheels = tree.laid_out(given, loop.WHEELS)
     assert wheels.at.dtype == np.intp and wheels.stiffness.dtype == float
-    words = arguments.words_of(wheels, channel.WHEELS)
-    assert len(words) == channel.WHEELS.size == 14 and words[1::2].tolist() == [1] * 7
+    words = tree.words_of(wheels, loop.WHEELS)
+    assert len(words) == loop.WHEELS.size == 14 and words[1::2].tolist() == [1] * 7
     with pytest.raises(AssertionError):
-        arguments.words_of(given, channel.WHEELS)
+        tree.words_of(given, loop.WHEELS)
 
 
 def test_a_command_that_is_no_number_is_told(robots):

@@ -29,20 +29,8 @@ _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
 
-class _Part(FrozenArrays):
-    """Base class of passive parts of a link."""
-
-    frame: str
-    name: str | None
-
-    @property
-    def title(self) -> str:
-        """Prefix of the names of the modes."""
-        return self.name or self.frame
-
-
 @dataclass(frozen=True, eq=False)
-class FlexibleAppendage(_Part):
+class FlexibleAppendage(FrozenArrays):
     r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
     Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
@@ -99,7 +87,7 @@ class FlexibleAppendage(_Part):
     rigid: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        what = f"flexible appendage '{_text('frame', self.frame)}'"
+        what = _title("flexible appendage", self.frame, self.name)
         frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
         damping, modes = as_double(f"damping of {what}", self.damping), frequency.size
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
@@ -122,8 +110,6 @@ class FlexibleAppendage(_Part):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "frequency", frequency)
         object.__setattr__(self, "damping", damping)
-        if self.name is not None:
-            _text("name", self.name)
         super().__post_init__()
 
     @classmethod
@@ -200,6 +186,11 @@ class FlexibleAppendage(_Part):
         return cls(frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid)
 
     @property
+    def title(self) -> str:
+        """Prefix of the names of the modes."""
+        return self.name or self.frame
+
+    @property
     def modes(self) -> tuple[str, ...]:
         """Names of the modes, which are coordinates of the robot."""
         return tuple(f"{self.title}_mode_{k}" for k in range(1, 1 + len(self.frequency)))
@@ -238,7 +229,7 @@ class FlexibleAppendage(_Part):
 
 
 @dataclass(frozen=True, eq=False)
-class Slosh(_Part):
+class Slosh:
     r"""Liquid that sloshes in a tank, modelled as a point mass that moves across the tank's axis.
 
     With `frequency`, the mass moves on springs, and its coordinates are the displacements NAME_x
@@ -294,9 +285,7 @@ class Slosh(_Part):
     name: str | None = None
 
     def __post_init__(self) -> None:
-        what = f"slosh '{_text('frame', self.frame)}'"
-        if self.name is not None:
-            what = f"slosh '{_text('name', self.name)}'"
+        what = _title("slosh", self.frame, self.name)
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
@@ -315,11 +304,10 @@ class Slosh(_Part):
                 "pendulum oscillates only under an acceleration; give the frequency [Hz] to "
                 "which the ratio refers"
             )
-        object.__setattr__(self, "damping", ratio)
         position = three_numbers(f"position of {what}", self.position)
-        object.__setattr__(self, "position", position)
         axis = unit_vector(f"axis of {what}", self.axis)
-        object.__setattr__(self, "axis", axis)
+        for name, checked in (("damping", ratio), ("position", position), ("axis", axis)):
+            object.__setattr__(self, name, checked)
 
     @classmethod
     def cylinder(
@@ -461,8 +449,11 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(entries)
 
 
-def _text(what: str, value: object) -> str:
-    printable = isinstance(value, str) and value.strip() and value.isprintable()
-    if not printable or (what == "name" and set(str(value)) & set("*?[]")):
-        raise InputError(f"{what} of an appendage is {value!r}, expected a name without *?[]")
-    return str(value)
+def _title(kind: str, frame: object, name: object) -> str:
+    """Return what messages call an appendage, or raise `InputError` for an invalid name."""
+    for what, value in {"frame": frame, **({} if name is None else {"name": name})}.items():
+        printable = isinstance(value, str) and value.strip() and value.isprintable()
+        if not printable or (what == "name" and set(str(value)) & set("*?[]")):
+            said = f"{what} of an appendage is {value!r}, expected a name without *?[]"
+            raise InputError(said)
+    return f"{kind} '{frame if name is None else name}'"

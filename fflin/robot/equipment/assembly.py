@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -162,66 +162,64 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     return equipped(robot, bare, appendages=items)
 
 
-class _Modes(NamedTuple):
-    """Appendage on a body, with its participation L (6, k) in the body's frame."""
+def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
+    """Return the joint that carries an appendage, its placement and its participation L (6, k).
 
-    appendage: Appendage
-    joint: int
-    placement: pin.SE3
-    L: Array  # rows: translation, rotation about the body's origin
-
-
-def _seen(model: pin.Model, item: Appendage) -> _Modes:
+    The placement and L are in the frame of the carrying body, and L is about the body's origin.
+    """
     joint, placement = find_frame(model, item.frame)
-    R, p = placement.rotation, placement.translation
-    t, r = (R @ part for part in np.split(item.participation, 2))
-    r = r + np.cross(p, t, axisb=0, axisc=0)
-    return _Modes(item, joint, placement, np.vstack((t, r)))
+    return joint, placement, placement.toDualActionMatrix() @ item.participation
 
 
 def _mounted_modes(
     bare: Robot, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
     """Return the bodies of all modes, and subtract them from the bodies that carry them."""
-    found = [_seen(bare.model, item) for item in appendages]
-    for item in found:
-        _compare_inertia(item, bodies[item.joint], bare)
-    for joint in dict.fromkeys(item.joint for item in found):
-        on_body = [item for item in found if item.joint == joint]
-        L = np.hstack([item.L for item in on_body])
-        body = bodies[joint]
+    model, parts = bare.model, list[Mounted]()
+    of_body: dict[int, list[tuple[Appendage, pin.SE3, Array]]] = {}
+    for item in appendages:
+        joint, placement, L = _carried(model, item)
+        of_body.setdefault(joint, []).append((item, placement, L))
+        _compare_inertia(item, placement, bodies[joint], bare)
+    for joint, items in of_body.items():
+        body, L = bodies[joint], np.hstack([L for _, _, L in items])
         rows = np.array([body.mass]), body.lever[None], body.inertia[None]
-        names = [name for item in on_body for name in item.appendage.modes]
+        names = [name for item, _, _ in items for name in item.modes]
         for k, mode in enumerate(names, start=1):
             least = float(_least_eigenvalue(*rows, L[:, :k])[0])
             if not least >= -_NEGATIVE:
                 raise InputError(
                     f"the effective masses of the modes up to '{mode}' exceed the inertia of "
-                    f"{carrier_name(bare.model, joint)} ({body.mass:.4g} kg): M_rr - L L^T has "
+                    f"{carrier_name(model, joint)} ({body.mass:.4g} kg): M_rr - L L^T has "
                     f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the "
                     "inertia in the URDF must include the appendage as if it were rigid"
                 )
-    parts: list[Mounted] = []
-    for item in found:
-        if isinstance(item.appendage, Slosh):
-            parts += _liquid(item.appendage, item, bodies)
-    balls: dict[int, list[_Ball]] = {}
-    for item in found:
-        if isinstance(item.appendage, FlexibleAppendage):
-            balls.setdefault(item.joint, []).extend(_balls(item, bodies[item.joint]))
-    for joint in sorted(balls):
-        mass = sum(ball.mass for ball in balls[joint])
-        lighter = min(1.0, _LARGEST_SHARE * bodies[joint].mass / mass) if mass else 1.0
+        for item, placement, _ in items:
+            if isinstance(item, Slosh):
+                at = placement * np.array(item.position)
+                bodies[joint] = bodies[joint] - pin.Inertia(item.mass, at, np.zeros((3, 3)))
+                parts += _liquid(item, joint, placement)
+        columns = [
+            (name, column, placement.translation)
+            for item, placement, L in items
+            if isinstance(item, FlexibleAppendage)
+            for name, column in zip(item.modes, L.T, strict=True)
+        ]
+        body, lighter = bodies[joint], 1.0
+        balls = [_ball(joint, body, *column) for column in columns]
+        if mass := sum(ball.inertia.mass for ball in balls):
+            lighter = _LARGEST_SHARE * body.mass / mass
         if lighter < _LIGHTEST:
             raise InputError(
-                f"mode '{balls[joint][0].name}' moves the centre of mass of its body, but without "
-                f"the sloshing liquid this body has only {bodies[joint].mass:.3g} kg; the mass in "
-                "the URDF must include the appendage and the liquid"
+                f"mode '{balls[0].name}' moves the centre of mass of its body, but without the "
+                f"sloshing liquid this body has only {body.mass:.3g} kg; the mass in the URDF must "
+                "include the appendage and the liquid"
             )
-        for ball in balls[joint]:
-            part, removed = ball.mounted(joint, lighter)
-            parts.append(part)
-            bodies[joint] = bodies[joint] - removed
+        if lighter < 1.0:
+            balls = [_ball(joint, body, *column, lighter) for column in columns]
+        for ball in balls:
+            bodies[joint] = bodies[joint] - ball.placement.act(ball.inertia)
+        parts += balls
     return parts
 
 
@@ -242,15 +240,16 @@ def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[
     return found
 
 
-def _compare_inertia(item: _Modes, body: pin.Inertia, bare: Robot) -> None:
+def _compare_inertia(
+    appendage: Appendage, placement: pin.SE3, body: pin.Inertia, bare: Robot
+) -> None:
     """Warn if a file's rigid inertia differs from the link's."""
-    appendage = item.appendage
     if not isinstance(appendage, FlexibleAppendage) or appendage.inertia is None:
         return
     what = f"the body with frame '{appendage.frame}'"
     if (link := bare.pieces.get(appendage.frame)) is not None:
         body, what = as_inertia(link), f"link '{appendage.frame}'"
-    of_file, of_link = rigid_inertia(appendage.inertia), body.se3Action(item.placement.inverse())
+    of_file, of_link = rigid_inertia(appendage.inertia), body.se3Action(placement.inverse())
     M = of_link.matrix()
     scale = np.array([1.0, 1.0, 1.0, *[1.0 / _radius_of_gyration(of_link)] * 3])
     apart = np.abs(M - appendage.inertia) * np.outer(scale, scale)
@@ -307,91 +306,64 @@ def first_impossible(
     `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
     Return None if all rows are possible.
     """
-    found = [_seen(model, item) for item in appendages]
+    found = [_carried(model, item) for item in appendages]
     impossible = []
     for joint, rows in bodies.items():
-        if of_body := [item.L for item in found if item.joint == joint]:
+        if of_body := [L for carrier, _, L in found if carrier == joint]:
             least = _least_eigenvalue(*rows, np.hstack(of_body))
             impossible += np.flatnonzero(~(least >= -_NEGATIVE)).tolist()
     return min(impossible, default=None)
 
 
-class _Ball(NamedTuple):
-    """Ball that represents a mode, in the frame of the body that carries it."""
+def _ball(
+    joint: int, body: pin.Inertia, name: str, column: Array, p: Array, lighter: float = 1.0
+) -> Mounted:
+    """Return the ball of a mode with the participation `column` (6,) about its body's origin.
 
-    name: str
-    t: Array  # (3,) translation part of the participation
-    r: Array  # (3,) rotation part of the participation about the ball's centre
-    center: Array
-    mass: float  # [kg] mass with which no rotor is needed
-    moment: float  # [kg m^2] moment of inertia of the ball
-    rotation: float  # [rad] of the structure per unit of the amplitude
-
-    def mounted(self, joint: int, lighter: float) -> tuple[Mounted, pin.Inertia]:
-        """Return the ball on its joint, and the inertia to subtract from the body.
-
-        The ball has the fraction `lighter` of `mass`.
-        """
-        mass = lighter * self.mass
-        v = self.t / mass if mass else np.zeros(3)
-        w = self.r / self.moment if self.moment else np.zeros(3)
-        # The inertia of a rotor compensates a different mass of the ball: S^T I S + rotor = 1.
-        rotor = 1.0 - float(self.t @ v + self.r @ w)
-        rotor = 0.0 if abs(rotor) < 1e-13 else rotor
-        moving, turning = float(np.linalg.norm(v)), float(np.linalg.norm(w))
-        if turning:
-            axis, scale = w / turning, turning
-            origin: Array = self.center + np.cross(w, v) / turning**2
-            pitch = float(v @ w) / turning**2
-            motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
-        else:
-            axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
-            origin, motion = self.center, pin.JointModelPZ()
-        R, sphere = turned_to(axis), self.moment * np.eye(3)
-        own = pin.Inertia(mass, R.T @ (self.center - origin), sphere)
-        mode = Joint(
-            self.name, prismatic=not turning, kind="modal", scale=scale, rotation=self.rotation
-        )
-        part = Mounted(mode, joint, pin.SE3(R, origin), motion, own, rotor / scale**2)
-        return part, pin.Inertia(mass, self.center, sphere)
-
-
-def _balls(item: _Modes, body: pin.Inertia) -> list[_Ball]:
-    """Return a ball for each mode of a flexible appendage."""
-    p, size = item.placement.translation, _radius_of_gyration(body)
-    balls = []
-    for name, column in zip(item.appendage.modes, item.L.T, strict=True):
-        # Refer participation to the appendage's frame: only there, a pure translation has r = 0.
-        t, r = column[:3], column[3:] - np.cross(p, column[:3])
-        square, center = float(t @ t), np.zeros(3)
-        if math.sqrt(square) * size > _NONE * float(np.linalg.norm(r)):
-            center = np.cross(t, r) / square
-            # Limit the ball's distance to the body's radius of gyration.
-            center *= min(1.0, size / max(float(np.linalg.norm(center)), 1e-300))
-        else:
-            t, square = np.zeros(3), 0.0
-        r = r - np.cross(center, t)
-        rest = float(np.linalg.norm(r))
-        far = max(size, float(np.linalg.norm(p))) * math.sqrt(square)
-        if rest <= _NONE * max(far, float(np.linalg.norm(column[3:]))):
-            r, rest = np.zeros(3), 0.0
-        moment = rest**2 + size**2 * square if rest else 0.0
-        mass = square + (rest / size) ** 2 if square else 0.0
-        # Per unit of the amplitude, the ball rotates by w and moves by v. It is at the distance c
-        # from the appendage's frame. The rotation of the structure is at most |w| + |v| / |c|.
-        lever, rotation = float(np.linalg.norm(center)), rest / moment if moment else 0.0
-        if mass and lever >= _SHORTEST * size:
-            rotation += math.sqrt(square) / mass / lever
-        balls.append(_Ball(name, t, r, p + center, mass, moment, rotation))
-    return balls
+    p (3,) is the origin of the appendage's frame. The ball has the fraction `lighter` of the mass
+    with which it needs no rotor.
+    """
+    # Refer participation to the appendage's frame: only there, a pure translation has r = 0.
+    t, r, size = column[:3], column[3:] - np.cross(p, column[:3]), _radius_of_gyration(body)
+    square, center = float(t @ t), np.zeros(3)
+    if math.sqrt(square) * size > _NONE * math.hypot(*r):
+        center = np.cross(t, r) / square
+        # Limit the ball's distance to the body's radius of gyration.
+        center *= min(1.0, size / max(math.hypot(*center), 1e-300))
+    else:
+        t, square = np.zeros(3), 0.0
+    r, lever = r - np.cross(center, t), math.hypot(*center)
+    rest, far = math.hypot(*r), max(size, math.hypot(*p)) * math.sqrt(square)
+    if rest <= _NONE * max(far, math.hypot(*column[3:])):
+        r, rest = np.zeros(3), 0.0
+    moment = rest**2 + size**2 * square if rest else 0.0
+    mass = square + (rest / size) ** 2 if square else 0.0
+    # Per unit of the amplitude, the ball rotates by w and moves by v. It is at the distance c
+    # from the appendage's frame. The rotation of the structure is at most |w| + |v| / |c|.
+    rotation = rest / moment if moment else 0.0
+    if mass and lever >= _SHORTEST * size:
+        rotation += math.sqrt(square) / mass / lever
+    mass, center, sphere = lighter * mass, p + center, moment * np.eye(3)
+    v, w = t / (mass or 1.0), r / (moment or 1.0)
+    moving, turning = math.hypot(*v), math.hypot(*w)
+    if turning:
+        axis, scale = w / turning, turning
+        origin, pitch = center + np.cross(w, v) / turning**2, float(v @ w) / turning**2
+        motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+    else:
+        axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
+        origin, motion = center, pin.JointModelPZ()
+    # The inertia of a rotor compensates a different mass of the ball: S^T I S + rotor = 1.
+    rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
+    rotor = 0.0 if abs(rotor) < 1e-13 else rotor
+    mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
+    inertia = pin.Inertia(mass, R.T @ (center - origin), sphere)
+    return Mounted(mode, joint, pin.SE3(R, origin), motion, inertia, rotor / scale**2)
 
 
-def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mounted]:
-    """Return a slosh mass as two joints, the second with the mass; subtract it from the body."""
-    joint, placement = item.joint, item.placement
+def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
+    """Return a slosh mass as two joints, the second with the mass."""
     x, y, z = (placement.rotation @ slosh.axes).T
-    at, point = placement * np.array(slosh.position), np.zeros((3, 3))
-    bodies[joint] = bodies[joint] - pin.Inertia(slosh.mass, at, point)
     # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, and so also
     # moves along x and y.
     slides = slosh.length is None
@@ -403,7 +375,8 @@ def _liquid(slosh: Slosh, item: _Modes, bodies: list[pin.Inertia]) -> list[Mount
         for name in slosh.modes
     ]
     motion = pin.JointModelPZ if slides else pin.JointModelRZ
+    hinge = pin.SE3(first, placement * np.array(slosh.position) + arm)
     between = pin.SE3(first.T @ second, np.zeros(3))
-    mass = pin.Inertia(slosh.mass, second.T @ -arm, point)
-    outer = Mounted(across[0], joint, pin.SE3(first, at + arm), motion(), pin.Inertia.Zero())
+    mass = pin.Inertia(slosh.mass, second.T @ -arm, np.zeros((3, 3)))
+    outer = Mounted(across[0], joint, hinge, motion(), pin.Inertia.Zero())
     return [outer, Mounted(across[1], slosh.modes[0], between, motion(), mass)]

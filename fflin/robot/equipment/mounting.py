@@ -1,6 +1,6 @@
 """Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -53,15 +53,20 @@ def with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounte
     new = pin.Model()
     new.name, new.gravity = model.name, model.gravity
     moved, added = {0: 0}, dict[int | str, int]()
-    for item in _depth_first(model, on, ROOT):
+    # CRBA needs the joints in depth-first order; mounted bodies come after a joint's other joints.
+    left: list[int | Mounted] = [ROOT]
+    while left:
+        item = left.pop()
         if isinstance(item, Mounted):
+            key: int | str = item.name
             index = new.addJoint(added[item.carrier], item.motion, item.placement, item.name)
-            body = item.inertia
+            body, children = item.inertia, []
         else:
-            parent, placement = moved[model.parents[item]], model.jointPlacements[item]
+            key, parent, placement = item, moved[model.parents[item]], model.jointPlacements[item]
             index = new.addJoint(parent, model.joints[item], placement, model.names[item])
-            body, moved[item] = bodies[item], index
-        added[item.name if isinstance(item, Mounted) else item] = index
+            body, children, moved[item] = bodies[item], model.children[item].tolist(), index
+        added[key] = index
+        left += [*reversed(on.get(key, [])), *reversed(children)]
         # The body is not passed to appendBodyToJoint, which divides by its mass (perhaps zero).
         new.appendBodyToJoint(index, pin.Inertia.Zero(), pin.SE3.Identity())
         new.inertias[index] = body
@@ -77,20 +82,6 @@ def with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounte
         copy.parentJoint = moved[frame.parentJoint]
         new.addFrame(copy, False)
     return new
-
-
-def _depth_first(
-    model: pin.Model, on: Mapping[int | str, Sequence[Mounted]], root: int | str
-) -> Iterator[int | Mounted]:
-    """Yield a root and all that it carries; mounted bodies come after a joint's other joints."""
-    # CRBA needs the joints in depth-first order.
-    if isinstance(root, int):
-        yield root
-        for child in model.children[root]:
-            yield from _depth_first(model, on, child)
-    for part in on.get(root, ()):
-        yield part
-        yield from _depth_first(model, on, part.name)
 
 
 def carry_over(model: pin.Model, new: pin.Model, moved: Mapping[int, int]) -> None:

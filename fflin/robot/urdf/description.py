@@ -253,11 +253,8 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
 Part = TypeVar("Part", Link, JointElement)
 
 
-def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement], int]:
-    """Check the elements of a URDF, and return its links, its joints and the depth of their tree.
-
-    Both are in the order of the file. The depth is the number of links on the longest path.
-    """
+def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
+    """Check the elements of a URDF, and return its links and its joints in the file's order."""
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     root.refuse_near_miss("link", "joint")
@@ -281,7 +278,8 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement], 
             "that are fixed to each other"
         )
     joints = _by_name(read_joint, root.find_all("joint"))
-    return links, joints, _depth(root, links, joints)
+    _check_tree(root, links, joints)
+    return links, joints
 
 
 def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[str, Part]:
@@ -297,8 +295,8 @@ def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[s
     return parts
 
 
-def _depth(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> int:
-    """Check that the joints connect the links into one tree; return the tree's depth in links."""
+def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> None:
+    """Raise `UrdfError` unless the joints connect the links into one tree that is not too deep."""
     above: dict[str, JointElement] = {}
     children: dict[str, list[str]] = {}
     for joint in joints.values():
@@ -337,7 +335,6 @@ def _depth(root: Element, links: dict[str, Link], joints: dict[str, JointElement
             f"the tree is {depth} links deep, expected at most {_DEPTH_LIMIT}; merge links that "
             "are fixed to each other"
         )
-    return depth
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:

@@ -3,7 +3,8 @@
 import hashlib
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -26,10 +27,10 @@ from fflin.robot.urdf.description import (
 )
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
-_SIZE_LIMIT = 64 * 2**20
+SIZE_LIMIT = 64 * 2**20  # bytes
 
-# Up to this depth, the recursion of the parsers fits into the smallest stack of a thread, 512 kB.
-_SHALLOW = 100
+# Stack of the thread in which urdfdom and Pinocchio recurse along the tree. The usual stack of a
+# thread may have only 512 kB.
 _STACK = 16 * 2**20
 
 _UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
@@ -71,13 +72,13 @@ class Urdf(NamedTuple):
 
 def read_urdf(path: Path) -> Urdf:
     """Read a URDF or xacro file as a free-flying robot."""
-    return describe(read_document(path), path)
+    return describe(read_file(path, "URDF", SIZE_LIMIT), path)
 
 
 def describe(document: bytes, path: Path) -> Urdf:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root, notes = plain_root(document, path)
-    links, joints, depth = read_tree(root)
+    links, joints = read_tree(root)
     mimics = resolve_mimics(joints)
     # The joint model of a continuous joint does not count turns. Leaders count them if a full turn
     # leaves a mimic joint displaced.
@@ -92,9 +93,15 @@ def describe(document: bytes, path: Path) -> Urdf:
     name = root.attributes.get("name", "").strip()
     clean = write_urdf(name, links, joints, counted)
     try:
-        model = _with_stack(
-            depth, lambda: pin.buildModelFromXML(clean, pin.JointModelFreeFlyer(), root_joint)
-        )
+        with ThreadPoolExecutor(1) as other:
+            usual = threading.stack_size(_STACK)
+            try:
+                built = other.submit(
+                    pin.buildModelFromXML, clean, pin.JointModelFreeFlyer(), root_joint
+                )
+            finally:
+                threading.stack_size(usual)
+        model: pin.Model = built.result()
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
@@ -151,26 +158,6 @@ def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
         of = named("joint", joints) if len(joints) < 3 else f"{len(joints)} joints"
         limits = ", ".join(what for what, names in zero.items() if names == joints)
         yield "passive", joints, f"{origin}: {limits} 0 of {of}: no limit (or passive)"
-
-
-def read_document(path: Path) -> bytes:
-    """Return the content of a URDF file, or raise `FileError`."""
-    return read_file(path, "URDF", _SIZE_LIMIT)
-
-
-def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
-    """Call a function that recurses along the tree, in a thread with a large enough stack."""
-    if depth <= _SHALLOW:
-        return call()
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(1) as other:
-        usual = threading.stack_size(_STACK)
-        try:
-            built = other.submit(call)
-        finally:
-            threading.stack_size(usual)
-        return built.result()
 
 
 def write_urdf(
