@@ -1,7 +1,5 @@
 """Dispersions: random values by name, and the robots and initial states that follow from them."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from copy import copy

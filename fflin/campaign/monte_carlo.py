@@ -1,7 +1,5 @@
 """Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

@@ -4,8 +4,6 @@ The norm is the square root of a Lyapunov function of the linear loop. The rate 
 minus a quadratic form in units of energy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

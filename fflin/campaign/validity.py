@@ -1,7 +1,5 @@
 """Validity of a linear model: its prediction error, and settling of its closed loop."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from concurrent.futures import Executor
