@@ -1,7 +1,9 @@
 """Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -11,6 +13,9 @@ from fflin.base.validation import Array, frozen
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.urdf.description import is_impossible
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
 
 # Arrays of a Pinocchio model: first those with an entry for each entry of v, then for each entry
 # of q.
@@ -102,12 +107,15 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
     return joint, placement.rotation @ np.array(wheel.axis)
 
 
-def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
-    """Return (joint, momentum (3,) [N m s] in its frame) of the wheels without inertia."""
+def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
+    """Angular momentum stored in the wheels without inertia, by the joint that carries them.
+
+    Each entry is the joint index and the vector (3,) [N m s] in joint axes.
+    """
     stored: dict[int, Array] = {}
-    for _, wheel in named_wheels(inputs):
+    for _, wheel in named_wheels(robot.inputs):
         if wheel.momentum:
-            joint, axis = carrier(model, wheel)
+            joint, axis = carrier(robot.model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
     return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
 
