@@ -180,8 +180,8 @@ def _appended(
         each.name = f"{prefix}.{each.name}" if index else each.name
     new = pin.appendModel(model, added, frame_index(model, frame), placement)
     new.name, new.gravity = model.name, model.gravity
-    for part in (model, added):  # appendModel leaves out armatures
-        carry_over(part, new, {i: new.getJointId(part.names[i]) for i in range(1, part.njoints)})
+    for part in (model, added):
+        carry_over(part, new)
     on = new.getJointId(model.names[joint])
     new.addFrame(pin.Frame(prefix, on, at * placement, pin.FrameType.BODY), False)
     return new
