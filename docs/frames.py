@@ -35,7 +35,7 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
             runs_of = partial(settling_runs, there, False, None, 0.0, "python")
-            arrays = settle(runs_of, lambda _, x=x: x, 1, Execution())
+            arrays = settle(runs_of, x, Execution())
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 

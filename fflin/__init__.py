@@ -89,9 +89,8 @@ _PUBLIC = {
         "batch.configurations": "grid Grid random_configurations RandomConfigurations",
     },
     "Figures": {
-        "analysis.plots": "plot_matrices plot_check plot_modes",
         "campaign.plots": "plot_validity plot_funnel plot_campaign",
-        "control.plots": "plot_poles plot_loops",
+        "control.plots": "plot_matrices plot_check plot_modes plot_poles plot_loops",
         "simulation.plots": "plot_motion",
     },
     "Errors": {

@@ -141,9 +141,9 @@ from fflin.batch.configurations import random_configurations as random_configura
 from fflin.batch.configurations import RandomConfigurations as RandomConfigurations
 
 # Figures
-from fflin.analysis.plots import plot_matrices as plot_matrices
-from fflin.analysis.plots import plot_check as plot_check
-from fflin.analysis.plots import plot_modes as plot_modes
+from fflin.control.plots import plot_matrices as plot_matrices
+from fflin.control.plots import plot_check as plot_check
+from fflin.control.plots import plot_modes as plot_modes
 from fflin.campaign.plots import plot_validity as plot_validity
 from fflin.campaign.plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles

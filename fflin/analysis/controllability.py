@@ -7,20 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis import mechanics
+from fflin.analysis import mechanics, ranks
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.mechanics import ConservedMomenta, combination
 from fflin.analysis.observability import observability
-from fflin.analysis.ranks import (
-    FixedPoles,
-    Margin,
-    Noisy,
-    echelon,
-    image,
-    judged,
-    null_space,
-    unit_columns,
-)
 from fflin.base.errors import (
     DetectabilityError,
     FflinError,
@@ -99,7 +89,7 @@ class Controllability(FrozenArrays):
     stabilizable: bool
     reach: dict[str, int]
     method: str
-    margin: Margin
+    margin: ranks.Margin
     notes: tuple[str, ...]
     robot: str
 
@@ -196,18 +186,18 @@ def controllability(lin: LinearModel) -> Controllability:
     controllable, rows, names, method, fixed = found
     if names is None:
         z = conserved.selected
-        rows = echelon(rows.T, 1.0 / size[z])[0].T
+        rows = ranks.echelon(rows.T, 1.0 / size[z])[0].T
         states = tuple(lin.state_names[i] for i in z)
         names = [combination(row, states, 1.0 / size[z]) for row in rows]
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, conserved.selected] = rows
     # When the controllable states are named, prefer coordinates on which an input acts directly.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
-    basis, pivots = echelon(conserved.T @ controllable, size, np.tile(driven, 2))
+    basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
     fixed = fixed._replace(margin=conserved.margin & fixed.margin)
     if len(zero):
-        fixed = fixed._replace(decays=False, settling=Margin())
+        fixed = fixed._replace(decays=False, settling=ranks.Margin())
     groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
     weighted = (basis * size[:, None])[: len(groups)]
@@ -232,7 +222,7 @@ def controllability(lin: LinearModel) -> Controllability:
         fixed_poles=np.concatenate((zero, fixed.poles)),
         stabilizable=fixed.decays,
         reach={
-            title: image(unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
+            title: ranks.image(ranks.unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
             for group, title in titles.items()
             if group in groups
         },
@@ -245,7 +235,7 @@ def controllability(lin: LinearModel) -> Controllability:
 
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
-) -> tuple[Array, Array, list[str] | None, str, FixedPoles] | None:
+) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
     """Split the 2 r states without conserved momenta at rest; None if the test is inconclusive.
 
     Return a basis (2 r, d) of the controllable subspace, rows (2 r - d, 2 r) on which no input
@@ -255,13 +245,15 @@ def _by_second_order(
     if source is None:
         return None
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
-    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
+    idle, margin = ranks.null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
-        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.transformed(R / system.size))
+        everything, margin = np.eye(2 * r), margin.transformed(R / system.size)
+        fixed = ranks.FixedPoles(margin=margin)
         return everything, everything[:0], [], "closed form", fixed
-    found = unobservable(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
+    S = system.S.T
+    found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
     # The system is symmetric. Each motion (s, v) that the output S^T s does not observe therefore
@@ -307,8 +299,8 @@ def require_stabilizable(lin: LinearModel) -> None:
         robot = lin._robot
         if robot and any(robot.damping.get(name) for name in robot.wheels):
             missed += ", or remove the damping of the wheels"
-        _check_reach(lin, lin.A, lin.B, "stabilised by the inputs", missed, StabilizabilityError)
-        return
+        said = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
+        return _conclude(StabilizabilityError, *said)
     found, words = controllability(lin), ""
     if not found.stabilizable:
         # Name the momenta and the other states, but not the coordinates whose rates are the
@@ -319,39 +311,26 @@ def require_stabilizable(lin: LinearModel) -> None:
         if count:
             words += (
                 ", add a spring to any joint that no input moves (--stiffness, stiffness=), or "
-                "design on fflin.momentum_reduction(lin)"
+                "design on fflin.momentum_reduction(lin) (--reduce)"
             )
-    _conclude(StabilizabilityError, words, found.notes, found.margin)
+    return _conclude(StabilizabilityError, words, found.notes, found.margin)
 
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        _check_reach(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, DetectabilityError)
-        return
+        said = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
+        return _conclude(DetectabilityError, *said)
     found = observability(lin)
     words = "" if found.detectable else missed.format(listed(found.unobservable))
-    _conclude(DetectabilityError, words, found.notes, found.margin)
-
-
-def _conclude(
-    kind: type[FflinError], words: str, notes: Sequence[str], margin: Margin, depth: int = 4
-) -> None:
-    """Raise an error with `words` and the undecided ranks; without `words`, warn of these ranks."""
-    doubts = [note for note in notes if note.startswith("undecided")]
-    if words:
-        error: Any = kind("; ".join((words, *doubts)))
-        error.margin = margin
-        raise error
-    for note in doubts:
-        warnings.warn(note, FflinWarning, stacklevel=depth)
+    return _conclude(DetectabilityError, words, found.notes, found.margin)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` if a marginally stable mode has no weight in Q."""
     missed = "Q has no weight on {}, whose motion does not decay by itself; add a weight there"
-    _check_reach(lin, A.T, _root(Q), "weighted by Q", missed)
+    _conclude(InputError, *_reached(lin, A.T, _root(Q), "weighted by Q", missed))
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
@@ -360,7 +339,20 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
     )
-    _check_reach(lin, lin.A, _root(W), "excited by W", missed)
+    _conclude(InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed))
+
+
+def _conclude(
+    kind: type[FflinError], words: str, notes: Sequence[str], margin: ranks.Margin
+) -> None:
+    """Raise an error with `words` and the undecided ranks; without `words`, warn of these ranks."""
+    doubts = [note for note in notes if note.startswith("undecided")]
+    if words:
+        error: Any = kind("; ".join((words, *doubts)))
+        error.margin = margin
+        raise error
+    for note in doubts:
+        warnings.warn(note, FflinWarning, stacklevel=4)
 
 
 def _root(W: Array) -> Array:
@@ -374,15 +366,13 @@ def _root(W: Array) -> Array:
     return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
 
 
-def _check_reach(
-    lin: LinearModel,
-    A: Array,
-    B: Array,
-    what: str,
-    complaint: str,
-    error: type[FflinError] = InputError,
-) -> None:
-    """Raise an error if B does not reach a mode on the stability boundary; warn if undecided."""
+def _reached(
+    lin: LinearModel, A: Array, B: Array, what: str, complaint: str, *, unstable: bool = False
+) -> tuple[str, list[str], ranks.Margin]:
+    """Return words if B misses a mode on the stability boundary, undecided ranks, and the margin.
+
+    Modes beyond the boundary are tested if the design must stabilise `unstable` modes.
+    """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
@@ -390,11 +380,11 @@ def _check_reach(
     # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
     # rounding error. Poles closer than 1e-3 of the largest therefore count as equal.
     candidates = [complex(discrete)]
-    growing = (beyond > 0.0) & (error is not InputError)
+    growing = (beyond > 0.0) & unstable
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
-    missed, margin = list[Values](), Margin()
+    missed, margin = list[Values](), ranks.Margin()
     for pole in candidates:
         shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
         matrix = np.column_stack((shifted, B))
@@ -412,15 +402,15 @@ def _check_reach(
         ratios = values / (_RANK * values[0])
         rank = int((ratios > 1.0).sum())
         missed += list(vectors[rank:])
-        margin &= judged(ratios, vectors.T, rank)
-    doubts = tuple(
+        margin &= ranks.judged(ratios, vectors.T, rank)
+    doubts = [
         f"undecided: {_dominant(at[None], lin.state_names)} counts as "
         f"{'' if change < 0 else 'not '}{what}, but the test value is only {ratio:.2g} times its "
         "rounding error, so another machine may decide otherwise"
         for ratio, at, change in margin.doubts
-    )
+    ]
     words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
-    _conclude(error, words, doubts, margin, 5)
+    return words, doubts, margin
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:

@@ -5,27 +5,12 @@
 is less sensitive to rounding.
 """
 
-from __future__ import annotations
-
 from operator import itemgetter
 
 import numpy as np
 
+from fflin.analysis import ranks
 from fflin.analysis.mechanics import SecondOrder, rates_of_positions
-from fflin.analysis.ranks import (
-    EPS,
-    Decision,
-    FixedPoles,
-    Margin,
-    Noisy,
-    decided,
-    image,
-    judged,
-    null_space,
-    right_vectors,
-    stacked,
-    unit_columns,
-)
 from fflin.base.validation import Array, Values
 
 # A singular value above _SUSPICIOUS counts as nonzero. Singular values are computed only for
@@ -52,12 +37,12 @@ _ALIASED = 1e-6
 _DECAY = 1e-7
 
 # If one sample reduces a motion below this fraction, only its rounding error remains.
-_DEAD = 1e4 * EPS
+_DEAD = 1e4 * ranks.EPS
 
 
 def split_by_poles(
     X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False
-) -> tuple[Array, Array, Array, FixedPoles]:
+) -> tuple[Array, Array, Array, ranks.FixedPoles]:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
 
     Return a basis (nx, d) of the controllable subspace, its complement (nx, nx - d), which is the
@@ -90,15 +75,15 @@ def split_by_poles(
     # The tolerance is twenty times the rounding error of M^-1. For a sampled model it is at least
     # twenty times the rounding error of (A - I)/dt.
     root = np.sqrt(M.diagonal())
-    noise = len(X) * EPS * float(np.linalg.cond(M / np.outer(root, root)))
+    noise = len(X) * ranks.EPS * float(np.linalg.cond(M / np.outer(root, root)))
     if dt:
-        noise = max(noise, EPS * (unit / dt + float(np.linalg.norm(A, 2))))
+        noise = max(noise, ranks.EPS * (unit / dt + float(np.linalg.norm(A, 2))))
     # Orthogonal transformations split off left null vectors until none remain. This also removes
     # the whole chain of a defective eigenvalue. A staircase algorithm would carry the rounding
     # error of an ill-conditioned step into the next step.
     A, to = (A.T, to_x.T) if dual else (A, from_x)
-    B = unit_columns(to @ drive)
-    inside, margin = np.eye(2 * nv), Margin()
+    B = ranks.unit_columns(to @ drive)
+    inside, margin = np.eye(2 * nv), ranks.Margin()
     rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
         lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
@@ -106,25 +91,25 @@ def split_by_poles(
         if not lost.shape[1]:
             break
         rest = np.hstack((rest, inside @ lost))
-        inside = inside @ image(lost, 0.5)[1]
+        inside = inside @ ranks.image(lost, 0.5)[1]
     margin = margin.transformed(to_x[nv:, nv:], halved=True)
-    fixed = FixedPoles(margin=margin)
+    fixed = ranks.FixedPoles(margin=margin)
     if rest.shape[1]:
         rates, vectors = np.linalg.eig(rest.T @ A @ rest)
         shapes = to_x @ rest @ vectors
         poles = 1.0 + dt * rates / unit if dt else rates / unit
         decay = 1.0 - np.abs(poles) if dt else -rates.real
         least, most = int(decay.argmin()), int(decay.argmax())
-        slow = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
+        slow = ranks.decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
         if dt and abs(poles[most]) < _DEAD:
             # Two motions cannot be distinguished if both decay to rounding error within one sample.
-            margin &= decided(1.0, shapes[:, most]).transformed(1.0, halved=True)
+            margin &= ranks.decided(1.0, shapes[:, most]).transformed(1.0, halved=True)
         settling = slow.transformed(1.0, halved=True)
-        fixed = FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
+        fixed = ranks.FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
     return to_x @ inside, to_x @ rest, rest.T @ from_x, fixed
 
 
-def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
+def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
     """Return a real orthonormal basis (m, k) of the left eigenvectors of A orthogonal to B."""
     from scipy.linalg import eig
 
@@ -136,7 +121,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     # first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
     found: Array = np.zeros((len(A), 0))
-    margin, known = Margin(), np.zeros(0, dtype=complex)
+    margin, known = ranks.Margin(), np.zeros(0, dtype=complex)
     for start in candidates:
         pole = complex(start)
         for _ in range(_REFINEMENTS):
@@ -144,13 +129,13 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
             U, values, _ = np.linalg.svd(np.hstack((A - at * np.eye(len(A)), B)))
             last = U[:, -1]
             refined = complex(last.conj() @ A @ last)
-            if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
+            if not pole or abs(refined - pole) < ranks.EPS or values[-1] > _SUSPICIOUS:
                 break
             pole = refined
         if (np.abs(known - at) < _SAME_POLE).any():
             continue
         rank, single = int((values > tolerance).sum()), abs(at.imag) <= _SAME_POLE
-        margin &= judged(values / tolerance, U, rank, 1 if single else 2)
+        margin &= ranks.judged(values / tolerance, U, rank, 1 if single else 2)
         vectors = U[:, rank:]
         if not vectors.shape[1]:
             continue
@@ -159,13 +144,13 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
         # Poles that differ only by rounding error have the same vectors, so only new directions
         # are added.
         new = parts - found @ (found.T @ parts)
-        found = np.hstack((found, image(new, _SUSPICIOUS)[0]))
+        found = np.hstack((found, ranks.image(new, _SUSPICIOUS)[0]))
     return found, margin
 
 
 def unobservable(
-    system: SecondOrder, position: Noisy, velocity: Noisy, dt: float
-) -> tuple[Array, tuple[tuple[complex, Values], ...], FixedPoles] | None:
+    system: SecondOrder, position: ranks.Noisy, velocity: ranks.Noisy, dt: float
+) -> tuple[Array, tuple[tuple[complex, Values], ...], ranks.FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
     The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The
@@ -185,22 +170,24 @@ def unobservable(
     turns = np.round(apart.imag / (2.0 * np.pi))
     if ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any():
         return None
-    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
+    none, empty = (ranks.Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
     fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
     unit = slow / fast if fast and slow else 1.0
     scale = np.concatenate((1.0 / system.size, unit / system.size))
-    basis, at_origin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
+    basis, at_origin = ranks.null_space(
+        ranks.stacked([*rows, [position, velocity]]) @ np.diag(scale)
+    )
     margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
     at_zero = basis * scale[:, None]
     motions, poles = [at_zero], [0j] * at_zero.shape[1]
-    slowest = Decision(np.inf)
+    slowest = ranks.Decision(np.inf)
     missed: list[tuple[complex, Values]] = []
     for start in starts:
-        shapes, pole, judged = _missed_shapes_at(system, position, velocity, complex(start))
+        shapes, pole, certain = _missed_shapes_at(system, position, velocity, complex(start))
         if any(abs(pole - other) < _SAME_POLE * abs(pole) for other, _ in missed):
             continue
-        margin &= judged
+        margin &= certain
         if not shapes.shape[1]:
             continue
         # A pole must have as many independent eigenvectors as its multiplicity.
@@ -215,25 +202,25 @@ def unobservable(
         pair = [pole, pole.conjugate()] if pole.imag else [pole]
         motions += [motion.real, motion.imag][: len(pair)]
         poles += [each for each in pair for _ in shapes.T]
-        decay = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
-        slowest = min(slowest, Decision(decay, shapes[:, 0]), key=itemgetter(0))
+        decay = max(-pole.real / abs(pole) / (1e2 * ranks.EPS * len(system.M)), 0.0)
+        slowest = min(slowest, ranks.Decision(decay, shapes[:, 0]), key=itemgetter(0))
     known = [pole for pole, _ in missed]
     near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
     if any(near):
         return None
-    fixed = FixedPoles(
+    fixed = ranks.FixedPoles(
         poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
         decays=not at_zero.shape[1] and slowest.ratio > 1.0,
         margin=margin,
-        settling=Margin() if at_zero.shape[1] else decided(slowest.ratio, slowest.at),
+        settling=ranks.Margin() if at_zero.shape[1] else ranks.decided(slowest.ratio, slowest.at),
     )
     return np.hstack(motions), tuple(missed), fixed
 
 
 def _missed_shapes_at(
-    system: SecondOrder, position: Noisy, velocity: Noisy, pole: complex
-) -> tuple[Values, complex, Margin]:
+    system: SecondOrder, position: ranks.Noisy, velocity: ranks.Noisy, pole: complex
+) -> tuple[Values, complex, ranks.Margin]:
     """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(2 * _REFINEMENTS):
@@ -245,17 +232,17 @@ def _missed_shapes_at(
             size**2 * M.diagonal() + size * np.abs(D.diagonal()) + np.abs(K.diagonal())
         )
         units = np.outer(weight, weight)
-        spread = 4.0 * EPS * size**2 * np.outer(system.size, system.size)
+        spread = 4.0 * ranks.EPS * size**2 * np.outer(system.size, system.size)
         spread = (spread + size * system.D.noise + system.K.noise) / units
         noise = (position.noise + size * velocity.noise) / weight
         pencil = (s * s * M + s * D + K) / units
         seen = (position.values + s * velocity.values) / weight
         stack = np.vstack((pencil, seen)), np.vstack((spread, noise))
-        values, vectors, rank, margin = right_vectors(*stack, 2 if pole.imag else 1)
+        values, vectors, rank, margin = ranks.right_vectors(*stack, 2 if pole.imag else 1)
         shapes = vectors / weight[:, None]
         refined = _root(system, shapes[:, -1], pole)
         moved = abs(refined - pole) / size
-        if not 4.0 * EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
+        if not 4.0 * ranks.EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
             break
         pole = refined
     return shapes[:, rank:], pole, margin.transformed(1.0 / weight)

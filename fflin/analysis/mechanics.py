@@ -9,16 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fflin.analysis.ranks import (
-    EPS,
-    FixedPoles,
-    Margin,
-    Noisy,
-    echelon,
-    null_space,
-    stacked,
-    without_rounding,
-)
+from fflin.analysis import ranks
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
@@ -81,9 +72,9 @@ class SecondOrder:
     """Matrices of M a + D v + K s = S u, in coordinates s whose rates are the velocities v."""
 
     M: Array
-    K: Noisy
-    D: Noisy
-    S: Noisy  # (nv, nu)
+    K: ranks.Noisy
+    D: ranks.Noisy
+    S: ranks.Noisy  # (nv, nu)
 
     @cached_property
     def size(self) -> Array:
@@ -112,11 +103,11 @@ class SecondOrder:
         return min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
 
     @cached_property
-    def poles(self) -> tuple[Values, Margin]:
+    def poles(self) -> tuple[Values, ranks.Margin]:
         """Approximate nonzero poles, one of each conjugate pair, and the margin of the ranks."""
         rigid, margin = self._null(self.K, self.D)
         unloaded, other = self._null(self.K)
-        R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
+        R = ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
         if not r:
@@ -134,9 +125,9 @@ class SecondOrder:
         found = found[np.argsort(np.abs(found))][zeros:]
         return found[found.imag >= 0.0], margin & other
 
-    def _null(self, *matrices: Noisy) -> tuple[Array, Margin]:
-        stack = stacked([[matrix] for matrix in matrices]) @ np.diag(1.0 / self.size)
-        basis, margin = null_space(stack)
+    def _null(self, *matrices: ranks.Noisy) -> tuple[Array, ranks.Margin]:
+        stack = ranks.stacked([[matrix] for matrix in matrices]) @ np.diag(1.0 / self.size)
+        basis, margin = ranks.null_space(stack)
         return basis / self.size[:, None], margin.transformed(1.0 / self.size)
 
 
@@ -148,10 +139,10 @@ def second_order(lin: LinearModel) -> SecondOrder:
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
-    spread = 4.0 * nv * EPS * np.abs(rates)
+    spread = 4.0 * nv * ranks.EPS * np.abs(rates)
     if lin.dt:
         # Every entry of a matrix exponential has the rounding error of the largest entry.
-        spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
+        spread[:, : 2 * nv] += 4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
     # Forces that balance during a spin leave rounding errors. The model may have no other force
     # that gives a scale for these errors, so they are estimated from the spin rate.
@@ -159,15 +150,15 @@ def second_order(lin: LinearModel) -> SecondOrder:
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
-    forces = Noisy(M @ rates, noise)
+    forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # To find rounding errors, each entry of S is compared with the norm of its own column.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
     return SecondOrder(
         M=M,
-        K=without_rounding(K @ -N, size, size),
-        D=without_rounding(D @ -np.eye(nv), size, size),
-        S=without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+        K=ranks.without_rounding(K @ -N, size, size),
+        D=ranks.without_rounding(D @ -np.eye(nv), size, size),
+        S=ranks.without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
     )
 
 
@@ -204,7 +195,7 @@ class ConservedMomenta:
     # (r,): kept coordinates. If L1 x = L2 x = 0, they and their rates determine all other states.
     kept: Indices
     T: Array  # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
-    margin: Margin  # margin of the rank decision on r
+    margin: ranks.Margin  # margin of the rank decision on r
 
     @property
     def selected(self) -> Indices:
@@ -222,10 +213,10 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     lin = lin.generator or lin  # the continuous model conserves the same momenta
     nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
-    pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
-    free, margin = null_space(pushes @ np.diag(1.0 / size), states=2)
+    pushes = ranks.stacked([[system.K.T], [system.D.T], [system.S.T]])
+    free, margin = ranks.null_space(pushes @ np.diag(1.0 / size), states=2)
     # A column of W^T is a unit vector if the momentum belongs to a single coordinate.
-    basis, pivots = echelon(free / size[:, None], size)
+    basis, pivots = ranks.echelon(free / size[:, None], size)
     W = basis.T
     momenta = W @ lin.M
     # Find the coordinates whose rates are the momenta.
@@ -319,7 +310,7 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 
 
 def undecided(
-    lin: LinearModel, fixed: FixedPoles, what: str, count: int, settled: str = ""
+    lin: LinearModel, fixed: ranks.FixedPoles, what: str, count: int, settled: str = ""
 ) -> tuple[str, ...]:
     """Return notes on undecided ranks, and on a slowest motion that may or may not decay."""
     ranks = [

@@ -1,12 +1,9 @@
 """Natural modes of a linear model: free-free frequencies, damping ratios, shapes."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -21,9 +18,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
 # counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
@@ -212,16 +207,11 @@ class Modes:
         said += [f"note: {note}" for note in self.notes]
         parts = [folded([each]) for each in said]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
-        rows += [
-            [
-                f"{mode.frequency:.6g}" if mode.oscillates else ".",
-                f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
-                f"{mode.time_constant:.4g}" if mode.pole.real else ".",
-                "unstable" if mode.unstable else "",
-                "",
-            ]
-            for mode in self.modes
-        ]
+        for mode in self.modes:
+            swing = f"{mode.frequency:.6g}", f"{mode.damping_ratio:.4g}"
+            decay = f"{mode.time_constant:.4g}" if mode.pole.real else "."
+            growth = "unstable" * mode.unstable
+            rows.append([*(swing if mode.oscillates else ".."), decay, growth, ""])
         left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
         for row, mode in zip(rows[1:], self.modes, strict=True):
             row[-1] = _percents(mode.energy, width() - left)

@@ -1,7 +1,5 @@
 """Reduced linear models: without conserved momenta, without wheels, or of chosen states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -10,13 +8,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.mechanics import (
-    checked,
-    conserved,
-    floating_inertia,
-    second_order,
-    undecided,
-)
+from fflin.analysis import mechanics
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
@@ -143,10 +135,10 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     >>> reduced.state_names[:2], len(fflin.lqr(reduced, 1.0, 1.0).poles)
     (('q_m.joint_1', 'q_m.joint_2'), 6)
     """
-    whole = checked(lin)
+    whole = mechanics.checked(lin)
     wheels = removed_wheels(whole, wheel_speeds)
     lin = without(whole, wheels) if len(wheels) else whole
-    momenta = conserved(lin)
+    momenta = mechanics.conserved(lin)
     z, T = momenta.selected, momenta.T
     judged = [name not in lin.ignorable for name in lin.state_names]
     drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
@@ -163,7 +155,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         momenta=momenta.momenta @ in_whole,
         coordinates=momenta.coordinates @ in_whole,
         margin=momenta.margin,
-        notes=undecided(lin, FixedPoles(margin=momenta.margin), "kept by the reduction", len(z)),
+        notes=mechanics.undecided(
+            lin, FixedPoles(margin=momenta.margin), "kept by the reduction", len(z)
+        ),
     )
     return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
 
@@ -197,11 +191,11 @@ def generalized_inertia(lin: LinearModel) -> Array:
     >>> fflin.generalized_inertia(lin).shape
     (3, 3)
     """
-    lin = checked(lin)
+    lin = mechanics.checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
         raise InputError("the model lacks the states of the base; give the unreduced model")
-    inertia = floating_inertia(lin.M, np.arange(6, 6 + joints), np.arange(6))
+    inertia = mechanics.floating_inertia(lin.M, np.arange(6, 6 + joints), np.arange(6))
     return (inertia + inertia.T) / 2.0
 
 
@@ -266,7 +260,7 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
         return at, at
-    system = second_order(lin.generator or lin)
+    system = mechanics.second_order(lin.generator or lin)
     angle, speed = (~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D))
     return at[angle], at[angle & speed]
 
@@ -281,7 +275,7 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     _, free = ignorable_wheels(lin)
     if len(free) and wheel_speeds is None:
         turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
-        wheel_speeds = bool(second_order(lin.generator or lin).S.values[turning].any())
+        wheel_speeds = bool(mechanics.second_order(lin.generator or lin).S.values[turning].any())
     if not len(free) or not wheel_speeds:
         return free
     forces = rigid_forces(without(lin.generator or lin, free))
@@ -300,7 +294,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
-    driven = np.count_nonzero(second_order(source).S.values, axis=1)
+    driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
     base = [i for i in range(nv) if not driven[i] and lin.state_names[i].startswith("r_b.")]
     columns = [*base, *(i + nv for i in base)]
     if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
@@ -319,7 +313,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 
 def rigid_forces(body: LinearModel) -> Noisy:
     """Return the input matrix (r, nu) of the rigid motions, on which no spring acts."""
-    system = second_order(body)
+    system = mechanics.second_order(body)
     motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
     return system.S.after(motions.T)
 
@@ -328,9 +322,9 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
     """Remove coordinates (k,) and their rates from a model; exact for any motion of them (9.4)."""
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
-    rest = floating_inertia(lin.M, kept, removed)
+    rest = mechanics.floating_inertia(lin.M, kept, removed)
     # Set stiffness and damping to zero if they are only rounding errors of a spin.
-    nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
+    nv, A, system = len(lin.M), lin.A.copy(), mechanics.second_order(lin)
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
     if not lin.dt and not system.D.values.any():

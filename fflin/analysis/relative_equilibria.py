@@ -1,10 +1,7 @@
 """Relative equilibria of a rigid body in orbit, and their stability."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,11 +11,9 @@ from fflin.base.tables import grid
 from fflin.base.validation import Array, Complex, FrozenArrays, instance
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
+from fflin.dynamics.state import Frame
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.dynamics.state import Frame
 
 # Relative rounding error of the principal moments, which follow from sums over bodies and
 # eigenvalues.

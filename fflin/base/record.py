@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from dataclasses import Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -259,12 +259,6 @@ class Design(Result):
         False for a result read from a file without a digest, and for every result derived from it.
     """
 
-    # Names of one-dimensional arrays, which MATLAB stores as matrices.
-    VECTORS: ClassVar[tuple[str, ...]] = ()
-    # Names of arrays that may be infinite. JSON has no infinity, so the largest double replaces
-    # it.
-    OPEN: ClassVar[tuple[str, ...]] = ()
-
     verified: bool = field(default=True, kw_only=True)
 
     def save(self, path: str | Path) -> None:
@@ -280,10 +274,12 @@ class Design(Result):
         write_record(as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
-    def _of(cls: type[Kind], source: object, **own: Any) -> Kind:
-        """Return a result with `own` fields; other fields are the attributes of `source`."""
-        names = (each.name for each in fields(cls) if each.init and each.name not in own)
-        return cls(**{key: getattr(source, key) for key in names if hasattr(source, key)}, **own)
+    def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
+        """Return a result with `own` fields; others are attributes of the first source with it."""
+        names = [each.name for each in fields(cls) if each.init]
+        for source in sources:
+            own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own
+        return cls(**own)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
@@ -304,7 +300,7 @@ class Design(Result):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
-            values = {item.name: _value(cls, item, record[item.name]) for item in _saved(cls)}
+            values = {item.name: _value(item, record[item.name]) for item in _saved(cls)}
             return cls(**given, **values, verified=verified)
 
 
@@ -313,7 +309,8 @@ def record_of(design: Design) -> Record:
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)
-        value = np.nan_to_num(value, nan=np.nan) if item.name in design.OPEN else value
+        if item.type == "Open":  # JSON has no infinity, so the largest double replaces it
+            value = np.nan_to_num(value, nan=np.nan)
         record[item.name] = list(value) if isinstance(value, tuple) else value
     return record
 
@@ -324,7 +321,7 @@ def _saved(cls: type[Design]) -> list[Field[object]]:
     return [item for item in own if item.type != "Robot"]
 
 
-def _value(cls: type[Design], item: Field[object], raw: object) -> Any:
+def _value(item: Field[object], raw: object) -> Any:
     """Convert a value from a file to the type of its field's annotation."""
     for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
         if str(item.type).startswith(kind):
@@ -335,6 +332,7 @@ def _value(cls: type[Design], item: Field[object], raw: object) -> Any:
     if array.dtype.kind not in "fiuc" or not np.isfinite(array).all():
         raise ValueError(f"{item.name} is not an array of finite numbers")
     array = array.astype(complex if array.dtype.kind == "c" else float)
-    if item.name in cls.OPEN:
+    if item.type == "Open":
         array = np.where(np.abs(array) > _LARGEST, np.copysign(np.inf, array), array)
-    return array.ravel() if item.name in cls.VECTORS else array
+    # MATLAB stores vectors as matrices.
+    return array.ravel() if item.type in ("Vector", "Poles") else array

@@ -20,11 +20,14 @@ if TYPE_CHECKING:
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
     Values = NDArray[np.inexact[Any]]  # real or complex
+    Vector = Array  # one-dimensional
+    Poles = Values  # one-dimensional
+    Open = Array  # may have infinite entries
     Mask = NDArray[np.bool_]
     Indices = NDArray[np.intp]
 else:
     # Importing numpy.typing would take a tenth of the start time of the command line.
-    Array = Complex = Values = Mask = Indices = np.ndarray
+    Array = Complex = Values = Vector = Poles = Open = Mask = Indices = np.ndarray
 
 T = TypeVar("T")
 

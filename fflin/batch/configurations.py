@@ -373,22 +373,7 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
     return frozen(rows)
 
 
-def checked_velocities(robot: Robot, v: ArrayLike, count: int) -> Array:
-    """Return read-only velocities (N, nv) from an array (N, nv), or (nv,) for all points."""
-    every = bool(robot.followers)
-    return _checked("v", v, robot.nv, robot.checked_velocity, count, every=every)
-
-
-def checked_inputs(nu: int, u: ArrayLike, count: int) -> Array:
-    """Return read-only inputs (N, nu) from an array (N, nu), or (nu,) for all points."""
-
-    def check(row: ArrayLike) -> Array:
-        return vector("u", row, nu, "the robot's inputs")
-
-    return _checked("u", u, nu, check, count)
-
-
-def _checked(
+def checked_rows(
     name: str,
     given: ArrayLike,
     size: int,
@@ -397,7 +382,10 @@ def _checked(
     *,
     every: bool = False,
 ) -> Array:
-    """Return rows (count, size), checked where an entry is not finite, or `every` one."""
+    """Return read-only rows (count, size) from an array (count, size), or (size,) for all points.
+
+    Rows with an entry that is not finite are checked, or `every` row.
+    """
     if dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))
     rows = _rows(name, given, size, "one row for each point", count)

@@ -178,14 +178,19 @@ class MemoryStore:
 
     part = None  # there is no file
 
-    def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.count, self.chunk = count, chunk
+    def __init__(
+        self,
+        count: int,
+        chunk: int,
+        shapes: Mapping[str, tuple[int, ...]],
+        given: Mapping[str, Array] | None = None,
+    ) -> None:
+        self.count, self.chunk, self.arrays = count, chunk, dict(given or {})  # not copied
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
                 raise MemoryError
-            self.arrays: dict[str, Array] = {
-                key: np.empty((count, *shape)) for key, shape in shapes.items()
-            }
+            for key in shapes.keys() - self.arrays:
+                self.arrays[key] = np.empty((count, *shapes[key]))
         except (MemoryError, ValueError):
             raise InputError(
                 f"{count:,} rows do not fit into memory; write them to a file with "

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.base.errors import InputError, located
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array, instance, vector
+from fflin.base.validation import Array, Vector, instance, vector
 from fflin.batch.configurations import column, positions
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
@@ -55,11 +55,9 @@ class GainBatch(Design):
     ((9, 18), True)
     """
 
-    VECTORS: ClassVar = ("residual", "margin")
-
     K: Array
-    residual: Array
-    margin: Array
+    residual: Vector
+    margin: Vector
     joint_positions: Array
     joint_names: tuple[str, ...]
     state_names: tuple[str, ...]
@@ -179,7 +177,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         found = half_size(batch.A[0], B, Q, R) if direct else None
         if found is not None:
             K[index], residual[index] = found.K, found.residual
-            margin[index] = -found.poles.real.max()
+            margin[index] = found.margin
             continue
         with located(f"point {index}"):
             gain = lqr(batch[index], Q, R)

@@ -10,19 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import reading
-from fflin.base.validation import (
-    Array,
-    Indices,
-    Mask,
-    Result,
-    frozen,
-    number,
-    refuse_masked,
-    vector,
-)
+from fflin.base.validation import Result, frozen, number, refuse_masked, vector
 from fflin.base.writing import as_path
 from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
@@ -33,6 +25,7 @@ from fflin.linear.model import LinearModel
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from fflin.base.validation import Array, Indices, Mask
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
@@ -124,8 +117,7 @@ class LinearBatch(Result):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Fields of the models that are not fields of the batch: the same at all points, or taken from
-    # the robot.
+    # Further fields of the models: the same at all points, or taken from the robot.
     _asked: Mapping[str, object]
     verified: bool = True
 
@@ -203,9 +195,8 @@ class LinearBatch(Result):
             If a value is not a finite number, or no value is given.
         """
         distance = np.zeros(len(self))
-        for index, value in self._named(joints).items():
-            target = number(f"joint '{self.joint_names[index]}'", value)
-            distance += away(self.q, self.columns[index], target) ** 2
+        for what, column, value in self._named(joints):
+            distance += away(self.q, column, number(what, value)) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -219,14 +210,13 @@ class LinearBatch(Result):
             If a value is not a number or a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
-        for index, value in self._named(joints).items():
-            what = f"joint '{self.joint_names[index]}'"
+        for what, column, value in self._named(joints):
             if isinstance(value, tuple | list):
                 low, high = vector(what, value, 2, "(low, high)")
-                at = values(self.q, self.columns[index])
+                at = values(self.q, column)
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, self.columns[index], number(what, value)) <= _SAME
+                mask &= away(self.q, column, number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
@@ -302,7 +292,7 @@ class LinearBatch(Result):
         common = Prepared(
             robot, frame=found["frame"], reference=None, moving=found["moving"]
         ).common
-        return LinearBatch(**found, _asked=fields_of_model(common), verified=verified)
+        return LinearBatch(**found, _asked=common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
         """Return all arrays with one row per point, by name."""
@@ -312,13 +302,13 @@ class LinearBatch(Result):
     def header(self, count: int) -> dict[str, str]:
         """Return the header for a file with `count` points, as one JSON document."""
         first = self[0]
-        header = {key: getattr(self, key) for key in _TEXTS}
+        header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common: dict[str, object] = dict.fromkeys(_MODEL)  # None unless it is set below
-        common |= {key: getattr(self, key) for key in (*_TEXTS, "verified")}
+        common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
+        common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # The row is read from the file here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
@@ -328,8 +318,11 @@ class LinearBatch(Result):
         )
         rows["y0"] = rows.pop("_y0", rows["x0"])
         if self._reference is None:
-            rows["_reference"] = _in_world(root, rows["q"][:7])
-        return LinearModel({**common, **rows, **self._asked})
+            rows["_reference"] = base = rows["q"][:7]
+            if (root != AT_ROOT).any():
+                placed = pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)
+                rows["_reference"] = frozen(pin.SE3ToXYZQUAT(placed))
+        return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:
         q_m = positions(q, self.columns)
@@ -337,25 +330,22 @@ class LinearBatch(Result):
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, object]) -> dict[int, Any]:
+    def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Column, Any]]:
+        """Return for each named joint: its name in messages, its column and its given value."""
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
-        return {self.joint_names.index(name): value for name, value in joints.items()}
+        columns = dict(zip(self.joint_names, self.columns, strict=True))
+        return [(f"joint '{name}'", columns[name], value) for name, value in joints.items()]
 
 
-# Names of a batch's fields by kind, in order. The fields in _TEXTS are the same at all points and
+# Names of a batch's fields by kind, in order. The fields in TEXTS are the same at all points and
 # are stored in the header of a file. Arrays have one row per point.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
 _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None"]
-_TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
-
-
-def fields_of_model(common: Mapping[str, object]) -> dict[str, object]:
-    """Return the fields that are the same for all models and are not fields of a batch."""
-    return {key: value for key, value in common.items() if key not in _KINDS}
+TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
 
 
 def _checked_fields(
@@ -371,7 +361,7 @@ def _checked_fields(
         if array.dtype != np.float64 or len(array) != count:
             raise ValueError(f"{key} has {len(array)} rows of {array.dtype}, expected {count}")
         found[key] = frozen(array)
-    for key in _TEXTS:
+    for key in TEXTS:
         found[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
     found["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
     nx, nu, ny = (len(found[f"{kind}_names"]) for kind in ("state", "input", "output"))
@@ -391,12 +381,3 @@ def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:
         f"the {what} is computed from the robot, which the file does not contain; load the batch "
         f"with LinearBatch.load(path, robot), where robot is the unchanged '{name}'"
     )
-
-
-def _in_world(root: Array, base: Array) -> Array:
-    """Return the world placement (7,) of a base from its placement (7,) in the root's frame."""
-    import pinocchio as pin
-
-    if (root == AT_ROOT).all():
-        return base
-    return frozen(pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)))

@@ -12,15 +12,7 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
@@ -31,7 +23,7 @@ from typing import ParamSpec, Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, Mask, instance, whole
+from fflin.base.validation import Array, instance, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
 
@@ -50,11 +42,9 @@ Progress: TypeAlias = Callable[[int, int], object]
 Rows: TypeAlias = Mapping[str, Array]
 RowsOf: TypeAlias = Callable[[int, int], Rows]
 
-# First and last row + 1 of a chunk, the arrays of its result with its warnings, and the chunk with
-# the reason why it failed.
+# First and last row + 1 of a chunk, and the arrays of its result with its warnings.
 Span: TypeAlias = tuple[int, int]
 Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
-Failed: TypeAlias = tuple[int, int, str]
 
 
 class Job(Protocol):
@@ -80,7 +70,7 @@ class Execution:
 
     def __init__(
         self,
-        executor: Executor | None = None,
+        executor: futures.Executor | None = None,
         workers: int | None = None,
         threads: int | None = None,
         chunk: int | None = None,
@@ -88,7 +78,8 @@ class Execution:
     ) -> None:
         if executor is not None and workers is not None:
             raise InputError("executor and workers are both given; give only one of them")
-        instance("executor", executor, (Executor, NoneType), "a concurrent.futures.Executor")
+        kinds = futures.Executor, NoneType
+        instance("executor", executor, kinds, "a concurrent.futures.Executor")
         for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
             if value is not None:
                 whole(name, value, 1)
@@ -126,12 +117,16 @@ def run_chunks(
     how: Execution,
     progress: Progress | None = None,
     *,
+    of_what: str = "rows",
+    made: Callable[[dict[str, Array]], object] | None = None,
     upto: int | None = None,
-    all_needed: bool = False,
-) -> list[Failed]:
-    """Compute the missing chunks of a store, save the results, and return failed chunks."""
-    # The store saves the rows and results for which it has arrays. Only chunks that begin before
-    # `upto` are computed. If all chunks are needed, the run ends at the first failure.
+) -> None:
+    """Compute the missing chunks of a store, and save the results.
+
+    The store saves the rows and results for which it has arrays. Only chunks that begin before
+    `upto` are computed. If chunks fail, the others are computed, and `SweepError` is raised with
+    ``made(arrays of the other rows)``. Without `made`, the first failure raises `FflinError`.
+    """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)
@@ -141,22 +136,23 @@ def run_chunks(
             left.append((start, stop))
     if progress and done:
         progress(done, store.count)
-    failed, notes = list[Failed](), list[str]()
+    failed, notes = list[tuple[int, int, str]](), list[str]()
     for (start, stop), result in _results(job, rows, store, left, how):
         if isinstance(result, str):
             failed.append((start, stop, result))
-            if all_needed:
-                break
         else:
             store.write(start, stop, {**rows(start, stop), **result[0]})
             notes += result[1]
+        if failed and not made:
+            raise FflinError(failed[0][2])
         done += stop - start
         if progress:
             progress(done, store.count)
     if notes:
         more = f" (and {len(notes) - 1} more such warnings)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
-    return sorted(failed)
+    if failed and made:
+        raise _failure(sorted(failed), store, of_what, made)
 
 
 def _results(
@@ -176,15 +172,15 @@ def _results(
         for span in spans:
             yield span, here(*span)
         return
-    pool = how.executor or ThreadPoolExecutor(count)
+    pool = how.executor or futures.ThreadPoolExecutor(count)
     pickled = b"" if inside else pickle.dumps(job)
 
-    def submit(start: int, stop: int) -> Future[Result | str]:
+    def submit(start: int, stop: int) -> futures.Future[Result | str]:
         if inside:
             return pool.submit(here, start, stop)
         return pool.submit(work, pickled, rows(start, stop), start, stop)
 
-    waiting, running = deque(spans), dict[Future[Result | str], Span]()
+    waiting, running = deque(spans), dict[futures.Future[Result | str], Span]()
     try:
         while waiting or running:
             # Results wait in memory until they are consumed, so their number is limited.
@@ -194,9 +190,10 @@ def _results(
                     running[submit(*span)] = span
                 except Exception as error:  # broken, shut down, or specific to the executor
                     yield span, _reason(error)
-            # Chunks of this process end in order.
-            first = list(running)[:1]
-            for future in first if inside else wait(running, return_when=FIRST_COMPLETED).done:
+            ready = list(running)[:1]  # chunks of this process end in order
+            if not inside:
+                ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
+            for future in ready:
                 span = running.pop(future)
                 try:
                     result = future.result()
@@ -204,9 +201,6 @@ def _results(
                     if inside:
                         raise
                     result = _reason(error)
-                    if isinstance(error, NoWorkers):
-                        yield from ((each, result) for each in waiting)
-                        waiting.clear()
                 yield span, result
     finally:
         for future in running:
@@ -218,7 +212,7 @@ def _results(
 
 def _reason(error: Exception) -> str:
     """Return the reason why a chunk failed."""
-    if isinstance(error, FflinError | WorkerDied | NoWorkers):
+    if isinstance(error, FflinError):
         return str(error)
     return f"the executor failed: {type(error).__name__}: {error}".rstrip(": ")
 
@@ -237,13 +231,13 @@ def _unpickled(job: bytes) -> Job:
     return result
 
 
-def failure(
-    failed: list[Failed],
+def _failure(
+    failed: list[tuple[int, int, str]],
     store: FileStore | MemoryStore,
     of_what: str,
-    made: Callable[[Mask], object],
+    made: Callable[[dict[str, Array]], object],
 ) -> SweepError:
-    """Return the error that lists the failed chunks."""
+    """Return the error that lists the failed chunks; see `run_chunks`."""
     kept = np.ones(store.count, dtype=bool)
     for start, stop, _ in failed:
         kept[start:stop] = False
@@ -261,7 +255,7 @@ def failure(
             "from this file"
         )
     else:
-        batch = made(kept)
+        batch = made({key: rows[kept] for key, rows in store.read(store.count).items()})
         message += (
             "; the results of the other chunks are in the attribute `batch` of this error. With "
             "out='NAME.h5' (-o NAME.h5), the results would be saved, and the same call would "
@@ -270,41 +264,34 @@ def failure(
     return SweepError(message, tuple(failed), batch)
 
 
-class WorkerDied(BrokenExecutor):
-    """Error for a task whose worker process died; other workers continue."""
+class OwnWorkers(futures.ThreadPoolExecutor):
+    """Executor with worker processes; if one dies, its task fails and another one starts.
 
-
-class NoWorkers(BrokenExecutor):
-    """Error for worker processes that cannot be started."""
-
-
-class OwnWorkers(Executor):
-    """Executor with worker processes; if one dies, its task fails and another one starts."""
+    Each thread has a pool of one process, so that the others continue if a process dies.
+    """
 
     def __init__(self, count: int) -> None:
         cores = available_cores()
         if count > cores:
             said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
             warnings.warn(said, FflinWarning, stacklevel=4)
-            count = cores
-        self._max_workers = count
-        # Each thread has a pool of one process, so that the others continue if a process dies.
-        self._threads, self._mine = ThreadPoolExecutor(count), local()
-        self._lock, self._closed = Lock(), False
-        self._pools: list[ProcessPoolExecutor] = []
+        super().__init__(min(count, cores))
+        self._mine, self._lock = local(), Lock()
+        self._pools: list[futures.ProcessPoolExecutor] = []
+        self._ended = ""  # reason why no further process can start
 
-    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Call a function in a worker process; raise `WorkerDied` if the process dies."""
-        return self._threads.submit(self._do, partial(fn, *args, **kwargs))
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
+        """Call a function in a worker process; raise `FflinError` if the process dies."""
+        return super().submit(self._do, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
         # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait
         # for a future, the future remains locked. A thread that must set the result of this future
         # would never end.
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
-            self._closed = True
+            self._ended = "the workers have been shut down"
         for pool in self._pools:
             for process in list((pool._processes or {}).values()):
                 process.terminate()
@@ -314,34 +301,35 @@ class OwnWorkers(Executor):
         pool = getattr(self._mine, "pool", None) or self._start()
         try:
             return pool.submit(task).result()
-        except BrokenExecutor:
+        except futures.BrokenExecutor:
             self._mine.pool = None
-            raise WorkerDied(
+            raise FflinError(
                 "a worker process died, for example because the memory was full"
             ) from None
 
-    def _start(self) -> ProcessPoolExecutor:
+    def _start(self) -> futures.ProcessPoolExecutor:
         """Start a process for this thread and wait until it is ready."""
-        with self._lock:
-            if self._closed:
-                raise NoWorkers("the workers have been shut down")
-            try:
+        try:
+            with self._lock:
+                if self._ended:
+                    raise FflinError(self._ended)
                 with _starting():
                     # With fork, a process would inherit locks that other threads hold, and could
                     # wait for them forever.
-                    pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare)
+                    pool = futures.ProcessPoolExecutor(1, get_context("spawn"), _prepare)
                     ready = pool.submit(int)
-            except OSError as error:
-                raise NoWorkers(f"no worker process can be started: {error}") from None
-            self._pools.append(pool)
-        try:
+                self._pools.append(pool)
             ready.result()
-        except BrokenExecutor:
-            raise NoWorkers(
+        except OSError as error:
+            self._ended = f"no worker process can be started: {error}"
+        except futures.BrokenExecutor:
+            self._ended = (
                 'a worker process did not start; make the call under `if __name__ == "__main__":`'
-            ) from None
-        self._mine.pool = pool
-        return pool
+            )
+        else:
+            self._mine.pool = pool
+            return pool
+        raise FflinError(self._ended)
 
 
 # Threads start workers one at a time, because `_starting` changes a module that all threads share.

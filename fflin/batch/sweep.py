@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -20,19 +20,18 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, Indices, frozen
+from fflin.base.validation import Array, Indices, frozen, vector
 from fflin.batch.configurations import (
     Configurations,
     GivenConfigurations,
     as_configurations,
-    checked_inputs,
-    checked_velocities,
+    checked_rows,
     column,
     content,
 )
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
-from fflin.batch.linear_batch import AT_ROOT, LinearBatch, fields_of_model
-from fflin.batch.run import Execution, Progress, Rows, failure, run_chunks
+from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
+from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
 from fflin.kernel.compiled import checked_engine
@@ -52,9 +51,6 @@ if TYPE_CHECKING:
 # small enough that several of them fit in memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
-
-# Least number of chunks, so that all workers finish at about the same time.
-_SHARES = 32
 
 # Warning filters belong to the whole process, so only one thread at a time changes them.
 _TURN = Lock()
@@ -176,17 +172,15 @@ def sweep(
     task = SweepTask(job, points, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
-        same = how.count(job) if how.executor is None else 1
-        shares = 4 * same if how.executor is None else _SHARES
-        size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // shares)) // row
+        # All threads or workers compute equally many chunks.
+        same = how.count(job)
+        size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
         size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
-        # All threads compute equally many chunks.
         chunks = math.ceil(math.ceil(count / size) / same) * same
         size = math.ceil(count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
     store: FileStore | MemoryStore
     if path is None or path.suffix == ".npz":
-        held = {key: shape for key, shape in task.shapes.items() if key not in task.given}
-        store = MemoryStore(count, size, held)
+        store = MemoryStore(count, size, task.shapes, task.given)
     else:
         store = FileStore(
             path, task.request, count, size, task.shapes, task.constants, task.texts()
@@ -194,25 +188,12 @@ def sweep(
         if store.resumed:
             _log.info("resuming from %s", store.part)
     with closing(store), how:
-        failed = run_chunks(job, task.rows, store, how, progress)
-        if failed:
-            raise failure(
-                failed,
-                store,
-                "configurations",
-                lambda kept: task.batch(task.given | store.read(count))[kept],
-            )
-        batch = task.batch(task.given | store.complete())
+        of_what = "configurations"
+        run_chunks(job, task.rows, store, how, progress, of_what=of_what, made=task.batch)
+        batch = task.batch(store.complete())
     if path is not None and path.suffix == ".npz":
         batch.save(path)
     return batch
-
-
-def planned_bytes(
-    robot: Robot, count: int, *, at_rest: bool, frame: Frame | None, reference: pin.SE3 | None
-) -> int:
-    """Return the size [bytes] of a sweep's result over `count` points; see `ChunkJob`."""
-    return count * ChunkJob(robot, at_rest=at_rest, frame=frame, reference=reference).row_bytes
 
 
 class ChunkJob:
@@ -234,15 +215,21 @@ class ChunkJob:
         options: Any = {"frame": frame, "reference": reference, "moving": moving}
         self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
         self.linearizer = Linearizer(robot, **options)
-        self._engine = checked_engine(engine)
         prepared = self.linearizer.prepared
-        if engine == "compiled":
-            if prepared.sensing is not None:
-                raise InputError(
-                    "engine='compiled' is not possible, because the outputs are not the state; "
-                    "leave engine out"
-                )
-            prepared.kernel()  # raises an error if there is none
+        measured = prepared.sensing is not None
+        if checked_engine(engine) == "compiled" and measured:
+            raise InputError(
+                "engine='compiled' is not possible, because the outputs are not the state; "
+                "leave engine out"
+            )
+        in_python = engine == "python" or measured or prepared.not_compilable
+        # Compiled accelerations for many points at once; None if Python computes the points.
+        self._kernel: RowAccelerations | None = None
+        if engine == "compiled" or not in_python:
+            self._kernel = prepared.kernel()
+        self.threaded = self._kernel is not None
+        self._data = robot.create_data()
+        self._inertia = Inertia(prepared.map, self._data)
         # If a free robot is at rest about its own reference, A and f0 are constant, so only B is
         # computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -261,19 +248,6 @@ class ChunkJob:
     def __reduce__(self) -> tuple[object, ...]:
         # Only the arguments are pickled, because each worker needs its own work space.
         return self._again, ()
-
-    @cached_property
-    def _kernel(self) -> RowAccelerations | None:
-        """Compiled accelerations for many points at once; None if Python computes the points."""
-        prepared = self.linearizer.prepared
-        if self._engine == "python" or prepared.sensing is not None or prepared.not_compilable:
-            return None
-        return prepared.kernel()
-
-    @property
-    def threaded(self) -> bool:
-        """Whether threads can compute chunks in parallel; see `Job`."""
-        return self._kernel is not None
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
@@ -296,19 +270,14 @@ class ChunkJob:
             for key, array in out.items():
                 array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.removeprefix("_"))
             return
-        (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
+        inertia, actuation = self._inertia, self.linearizer.prepared.actuation
         B_lower = out["B_lower"][row]
         inverse = B_lower if actuation.default else np.empty((nv, nv))
         inertia.invert(q, inverse)
         if not actuation.default:
             # The columns do not depend on the base position, so the base is moved to the origin to
             # avoid rounding errors.
-            np.matmul(inverse, actuation.columns(data, inertia.centred(q)), out=B_lower)
-
-    @cached_property
-    def _inertia(self) -> tuple[Inertia, pin.Data]:
-        data = self.linearizer.robot.create_data()
-        return Inertia(self.linearizer.prepared.map, data), data
+            np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code; return the rows for which this is not accurate."""
@@ -325,7 +294,7 @@ class ChunkJob:
             return left[left < count]
         with np.errstate(all="ignore"):
             if self.only_inertia:
-                good = kernel.sound(q, kernel.write_inverse(q, out["B_lower"]))
+                good = kernel.write_inverse(q, out["B_lower"])
             else:
                 good = self._write_anywhere(kernel, rows, out)
         return np.flatnonzero(~good)
@@ -347,7 +316,7 @@ class ChunkJob:
             u = actuation.in_base_axes(chart, rows["u0"])
         q_m, nv = state.joint_positions(q), nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
-        c, judged = kernel.write(q, nu, q_m, u, A, B)
+        c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
         f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
@@ -356,7 +325,7 @@ class ChunkJob:
             out["_drift"][:] = drift(state, f0, rates.gravity)
         # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
         # checked, because it is finite if q0 and f0 are valid.
-        good = kernel.sound(q, judged) & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
+        good = good & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(values, values) < LARGEST
         return good
@@ -372,20 +341,24 @@ class SweepTask:
         v: ArrayLike | None,
         u: ArrayLike | None,
     ) -> None:
-        self.job, self.robot = job, job.linearizer.robot
-        self.configurations, self.count = configurations, len(configurations)
-        prepared, root = job.linearizer.prepared, self.robot.model.jointPlacements[ROOT]
+        self.job, self.robot = job, (robot := job.linearizer.robot)
+        self.configurations, self.count = configurations, (count := len(configurations))
+        prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
         # Rows that are known before the sweep; a velocity or input of all points is one row.
         self._known: dict[str, Array] = {}
         if v is not None:
-            self._known["v"] = checked_velocities(self.robot, v, self.count)
+            every = bool(robot.followers)
+            check = robot.checked_velocity
+            self._known["v"] = checked_rows("v", v, robot.nv, check, count, every=every)
         if u is not None:
-            self._known["u0"] = checked_inputs(len(prepared.actuation.names), u, self.count)
+            nu = len(prepared.actuation.names)
+            of_inputs = partial(vector, "u", size=nu, of_what="the robot's inputs")
+            self._known["u0"] = checked_rows("u", u, nu, of_inputs, count)
         # The known arrays that vary between points, and the shapes per point of all that do.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
         if isinstance(configurations, GivenConfigurations):
             self.given["q"] = configurations.q
-        self.shapes = {**job.shapes, "q": (self.robot.nq,)}
+        self.shapes = {**job.shapes, "q": (robot.nq,)}
         self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
         constants: dict[str, Array] = {
             **prepared.rest,
@@ -412,13 +385,10 @@ class SweepTask:
             rows[key] = np.broadcast_to(value, (count, *value.shape))
         for key in self.shapes:
             rows[key] = frozen(arrays[key].view())
-        common = dict(self.job.linearizer.prepared.common)
-        asked = fields_of_model(common)
-        texts = {
-            key: value for key, value in common.items() if key not in asked.keys() | {"C", "D"}
-        }
+        common = self.job.linearizer.prepared.common
+        rows |= {key: common[key] for key in TEXTS}
         columns = tuple(map(column, self.robot.joints))
-        return LinearBatch(**texts, **rows, columns=columns, _asked=asked)
+        return LinearBatch(**rows, columns=columns, _asked=common)
 
     def texts(self) -> dict[str, str]:
         """Return the strings that a file of the batch contains."""

@@ -353,26 +353,23 @@ class Campaign(FrozenArrays):
         variable `runs` contains the values.
         """
         target = as_path(path)
-        if target.suffix in (".csv", ".mat"):
-            self._save_table(target)
-        else:
+        if target.suffix not in (".csv", ".mat"):
             self._save(target)
-
-    def _save_table(self, path: Path) -> None:
+            return
         finals = (*KINDS, *self.state_names, *self.input_names)
         names = [f"drawn {name}" for name in self.names] + ["end", *finals]
         names += [f"worst {name}" for name in finals] + [f"settle {kind}" for kind in KINDS]
         values, units = zip(*map(self.figure, names), strict=True)
         columns = labels(["stop", *names], ["", *units])
         rows = np.column_stack((self.stop, *values))
-        if path.suffix == ".csv":
-            write_table(path, columns, rows)
+        if target.suffix == ".csv":
+            write_table(target, columns, rows)
             return
         from scipy.io import savemat
 
         content = io.BytesIO()
         savemat(content, {"columns": np.array(columns, dtype=object), "runs": rows})
-        write_atomically({path: content.getvalue()})
+        write_atomically({target: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write the campaign and further strings, such as the request that identifies the call."""

@@ -1,9 +1,7 @@
 """Dispersions: random values by name, and the robots and initial states that follow from them."""
 
-from __future__ import annotations
-
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -18,15 +16,14 @@ from fflin.base.names import by_name, group_of, input_keys
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
-from fflin.campaign.pointing import columns_of, in_lanes, misaligned
+from fflin.campaign.pointing import in_lanes, misaligned, turned
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import Tree
-from fflin.linear.model import LinearModel
+from fflin.kernel.tree import batch_tree
 from fflin.robot.equipment.assembly import first_impossible
 from fflin.robot.inputs import JointTorque
 from fflin.robot.joints import ROOT
@@ -55,13 +52,6 @@ class Column(NamedTuple):
     inverse: Inverse
 
 
-class Bound(NamedTuple):
-    """Function that creates a policy for a robot, and the linear model of its design, if any."""
-
-    bind: Callable[[Robot], Policy]
-    lin: LinearModel | None = None
-
-
 class Dispersions:
     """Dispersions of `monte_carlo`: random values, and the runs' robots and initial states."""
 
@@ -72,24 +62,24 @@ class Dispersions:
         self._times = times
         robot, reads = plant.robot, decider(policy)
         self._model = robot._bare.model
-        self._senses_states, sensors = isinstance(reads, StateFeedback), tuple[str, ...]()
-        if isinstance(reads, StateFeedback | LinearController):
-            sensors = reads.lin.state_names if self._senses_states else reads.lin.output_names
-        if isinstance(reads, TrajectoryOutputFeedback):
+        sensors = tuple[str, ...]()
+        if isinstance(reads, StateFeedback):
+            sensors = reads.lin.state_names
+        elif isinstance(reads, LinearController):
+            sensors = reads.lin.output_names
+        elif isinstance(reads, TrajectoryOutputFeedback):
             sensors = reads.filter.output_names
+        modes = tuple(each.name for each in robot.modes)
         # Names of the quantities of each kind.
         self._known: dict[str, tuple[str, ...]] = {
-            "state": plant.state.names,
             **dict.fromkeys(_OF_SENSORS, sensors),
             **dict.fromkeys(_OF_BODIES, tuple(robot.pieces)),
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, robot.joint_names),
+            "frequency": modes,
         }
-        modes = tuple(each.name for each in robot.modes)
-        if modes:
-            self._known["frequency"] = modes
-        kinds = [*self._known][1:]
-        self._known |= {"delay": ("delay",), "seed": (SEED,), "frequency": modes}
+        kinds = [*self._known]
+        self._known |= {"state": plant.state.names, "delay": ("delay",), "seed": (SEED,)}
         # Indices of the joints of the modes, in the order of the names.
         self._modes = [robot.joint_names.index(name) for name in modes]
         by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
@@ -155,11 +145,8 @@ class Dispersions:
             raise UnknownNameError(
                 f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
             ) from None
-        nominal = robot.springs
-        factors = {
-            **nominal._asdict(),
-            "frequency": nominal.stiffness[self._modes],
-        }.get(kind)
+        nominal, of_modes = robot.springs._asdict(), robot.springs.stiffness[self._modes]
+        factors = {**nominal, "frequency": of_modes}.get(kind)
         draws: dict[str, tuple[Inverse, list[int]]] = {}
         for at, (inverse, tied) in sorted(found.items()):
             own = names[at]
@@ -310,17 +297,21 @@ class Dispersions:
             return None
         gain, bias = self._of("gain", drawn), self._of("bias", drawn)
         until, angles = self._of("fails", drawn, np.inf), self._of("misalignment", drawn)
-        turn = columns_of(self._plant.robot, angles)
-        return ActuatorFaults(1.0 + gain, bias, until, turn)
+        turn: list[Array] = [np.empty((len(drawn), 0))]  # the actual axes of tau_b and F_b
+        for first in self._plant.triads:
+            turn += [turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))]
+        return ActuatorFaults(1.0 + gain, bias, until, np.concatenate(turn, axis=1))
 
     def delays(self, drawn: Array) -> Array:
         """Return the delays (N,) in integration steps."""
         late = self._of("delay", drawn)[:, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
-    def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
+    def in_lanes(self, drawn: Array) -> dict[str, Array]:
         """Return the arrays of the compiled loop that vary between runs."""
         plant, (q, v), count = self._plant, self.starts(drawn), len(drawn)
+        tree = batch_tree(plant.robot)
+        assert tree is not None
         runs = {"q": q, "nu": plant.state.velocities(v), **self._springs(drawn)}
         if faults := self._faults(drawn):
             runs |= faults._asdict()
@@ -336,12 +327,13 @@ class Dispersions:
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
-            turned = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
-            turned["bodies"] += runs.get("bodies", tree.bodies)
-            runs |= turned
+            pointed = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
+            pointed["bodies"] += runs.get("bodies", tree.bodies)
+            runs |= pointed
         if self._kinds & {*_OF_SENSORS}:
             sensors = self._known["sensor"]
-            names = plant.state.names if self._senses_states else sensors
+            of_states = isinstance(decider(self._policy), StateFeedback)
+            names = plant.state.names if of_states else sensors
             fed = [names.index(name) for name in sensors]
             for key, kind in (("sensed", "sensor"), ("noise", "noise")):
                 runs[key] = np.zeros((count, len(names)))
@@ -374,8 +366,8 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._of("misalignment", rows)[0])
             if isinstance(policy, Allocation):  # allocates to the nominal directions
-                nominal = bound(policy, plant.robot)
-                policy = Bound(lambda _: nominal)
+                policy, nominal = copy(policy), bound(policy, plant.robot)
+                vars(policy)["bind"] = lambda _: nominal
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
         own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
@@ -392,17 +384,18 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
         found: Array = bias + deviation * generator.standard_normal(len(bias))
         return found if given is None else found + np.asarray(given(t))
 
+    noisy = copy(policy)
     if not isinstance(policy, StateFeedback):
-        noisy = copy(policy)
         vars(noisy)["noise"] = error
         return noisy
     K = policy.K
 
     def bind(robot: Robot) -> Policy:
-        inner = bound(policy, robot)
+        inner = policy.bind(robot)
         return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ error(t)
 
-    return Bound(bind, policy.lin)
+    vars(noisy)["bind"] = bind
+    return noisy
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

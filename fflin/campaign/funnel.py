@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,7 @@ from fflin.base.record import Design
 from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
+    Vector,
     as_double,
     by_name,
     dimension,
@@ -123,18 +124,16 @@ class Funnel(Design):
     True
     """
 
-    VECTORS: ClassVar = ("t", "tried", "at", "knots")
-
     robot: Robot
-    t: Array
-    tried: Array
+    t: Vector
+    tried: Vector
     outcomes: Array
     goal: str
     within: str
     confidence: float
-    at: Array
+    at: Vector
     P: Array
-    knots: Array
+    knots: Vector
     q: Array
     v: Array
     u: Array
@@ -170,22 +169,24 @@ class Funnel(Design):
     @cached_property
     def attitude(self) -> Array:
         """Half-axes (m, 3) of the ellipsoids in base attitude [deg]."""
-        sines = np.array([_half_axes(W[:3]) for W in self._roots])
+        sines = np.linalg.svd(self._roots[:, :3], compute_uv=False)
         return np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
 
     @cached_property
     def position(self) -> Array:
         """Half-axes (m, 3) of the ellipsoids in base position [m]."""
-        return np.array([_half_axes(W[3:6]) for W in self._roots])
+        half: Array = np.linalg.svd(self._roots[:, 3:6], compute_uv=False)
+        return half
 
     @cached_property
     def joints(self) -> Array:
         """Half-axes (m, n) of the ellipsoids in each joint [rad|m]."""
-        return np.array([np.linalg.norm(W[6 : 6 + self.robot.n], axis=1) for W in self._roots])
+        half: Array = np.linalg.norm(self._roots[:, 6 : 6 + self.robot.n], axis=2)
+        return half
 
     @cached_property
-    def _roots(self) -> list[Array]:
-        return [self.root(t) for t in self.t.tolist()]
+    def _roots(self) -> Array:
+        return np.array([self.root(t) for t in self.t.tolist()])
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -272,11 +273,6 @@ class Funnel(Design):
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
         """Read a funnel of a robot from a file that `save` wrote; see `Gain.load` for errors."""
         return cls._read(as_path(path), robot=robot)
-
-
-def _half_axes(W: Array) -> Array:
-    """Return the half-axes (3,) of the image of the unit sphere under W (3, nx)."""
-    return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]
 
 
 def funnel(
@@ -387,7 +383,8 @@ def funnel(
             tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
             if progress:
                 progress(knot + 1, len(jobs))
-    return Funnel(
+    return Funnel._of(
+        motion,
         robot=robot,
         t=np.array([motion.t[k] for k, _ in indices]),
         tried=tried,
@@ -398,7 +395,6 @@ def funnel(
         at=by.t - by.t[0] + motion.t[0],
         P=by.P,
         knots=motion.t,
-        **{name: getattr(motion, name) for name in ("q", "v", "u", "hold", "frame", "verified")},
     )
 
 
@@ -438,7 +434,7 @@ def _tested(
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
         starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
-        return completed(job, lambda a, b: starts[a:b], len(e), how)["outcome"]
+        return completed(job, starts, how)["outcome"]
 
     largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
     reach = [

@@ -1,7 +1,5 @@
 """Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle
@@ -9,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from fflin.batch.files import (
     read_rows,
     require_room,
 )
-from fflin.batch.run import Execution, Progress, failure, run_chunks
+from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
 from fflin.campaign.runs import CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
@@ -218,7 +217,8 @@ def monte_carlo(
     if how.executor:
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
-    header["goals"] = wanted = _goals(goals, until, shapes, header)
+    none = {key: np.zeros((0, *shape)) for key, shape in shapes.items()}
+    header["goals"] = wanted = _goals(goals, until, Campaign.of(none, {**header, "goals": ()}))
     with placed(dispersions):
         job.dispersions.require_possible(runs)
     request = ""
@@ -231,23 +231,18 @@ def monte_carlo(
             texts = {"header": json.dumps(header), "constant": "[]"}
             store = FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
+    made = partial(Campaign.of, header=header, job=job)
     with closing(store), how:
         expect(progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
         done = runs if until is None else min(_STAGE, runs)
-        while not (failed := run_chunks(job, job.rows, store, how, progress, upto=done)):
+        while True:
+            run_chunks(job, job.rows, store, how, progress, of_what="runs", made=made, upto=done)
             if done == runs:
                 break
             found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
             if found.high - found.low <= width:
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
-        if failed:
-            raise failure(
-                *(failed, store, "runs"),
-                lambda kept: Campaign.of(
-                    {key: rows[kept] for key, rows in store.read(runs).items()}, header, job
-                ),
-            )
         for start in range(done, runs, store.chunk):  # runs that `until` has made unnecessary
             stop = min(start + store.chunk, runs)
             unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
@@ -270,19 +265,23 @@ def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
     return size
 
 
-def _goals(
-    given: object,
-    until: str | None,
-    shapes: Mapping[str, tuple[int, ...]],
-    header: Mapping[str, object],
-) -> tuple[str, ...]:
-    """Return the goals; raise an error for an invalid goal before any run begins."""
+def _require_sendable(job: CampaignJob) -> None:
+    try:
+        pickle.dumps(job)
+    except Exception as error:  # each object raises its own types
+        raise InputError(
+            f"robot, policy or spreads cannot be sent to workers ({error}); define their classes "
+            "and functions at the top level of a module, or leave workers and executor out"
+        ) from None
+
+
+def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
+    """Return the goals; raise an error for a goal that an empty campaign cannot evaluate."""
     listed = [given] if isinstance(given, str) else given
     goals: list[str] = [
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
         *([] if until is None else [until]),
     ]
-    none = Campaign.of(MemoryStore(1, 1, shapes).arrays, {**header, "goals": ()})
     for goal in goals:
         none.met(instance("a goal", goal, str, "a text such as 'attitude < 1 deg'"))
     return tuple(dict.fromkeys(goals))
@@ -299,16 +298,6 @@ def _earlier(path: Path, request: str) -> Campaign | None:
         f"{path} exists and was not written by this call; name another file, or replace the file "
         "with overwrite=True (--force)"
     )
-
-
-def _require_sendable(job: CampaignJob) -> None:
-    try:
-        pickle.dumps(job)
-    except Exception as error:  # each object raises its own types
-        raise InputError(
-            f"robot, policy or spreads cannot be sent to workers ({error}); define their classes "
-            "and functions at the top level of a module, or leave workers and executor out"
-        ) from None
 
 
 def _header(job: CampaignJob) -> dict[str, object]:

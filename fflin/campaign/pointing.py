@@ -1,7 +1,5 @@
 """Misaligned inputs: actual directions of thrusters, wheels, torques and forces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ import pinocchio as pin
 from fflin.base.validation import Array
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.equipment.mounting import turned_to
-from fflin.robot.inputs import Input, ReactionWheel, Thruster, named_inputs
+from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
@@ -25,23 +23,11 @@ def turned(direction: object, angles: Array) -> Array:
     return found
 
 
-def columns_of(robot: Robot, angles: Array) -> Array:
-    """Return the actual axes of tau_b and F_b in each run, as in `ActuatorFaults`."""
-    found: list[Array] = [np.zeros((len(angles), 0))]
-    for item, names, first in _indexed(robot):
-        if len(item.ENTRIES) == len(names) == 3:
-            found += [turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))]
-    return np.concatenate(found, axis=1)
-
-
 def misaligned(robot: Robot, angles: Array) -> Robot:
     """Return a robot whose thrusters and wheels are rotated by angles (nu, 2)."""
-    inputs = list[Input]()
-    for item, _, at in _indexed(robot):
-        if isinstance(item, Thruster | ReactionWheel):
-            inputs.append(_pointed(item, turned(_direction(item), angles[at : at + 1])[0]))
-        else:
-            inputs.append(item)
+    inputs = list(robot.inputs)
+    for place, item, _, at in _mounted(robot):
+        inputs[place] = _pointed(item, turned(_direction(item), angles[at : at + 1])[0])
     return robot.replace(inputs=inputs)
 
 
@@ -53,9 +39,7 @@ def in_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
     bodies = np.zeros((count, tree.bodies.size // 10, 10))
     inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
-    for item, own, at in _indexed(robot):
-        if not isinstance(item, Thruster | ReactionWheel):
-            continue
+    for _, item, own, at in _mounted(robot):
         joint, placement = find_frame(model, item.frame)
         body = names.index(model.names[joint]) - ROOT
         axes = tree.axes[body].T @ placement.rotation
@@ -89,9 +73,12 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
     return replace(item, axis=along.tolist())
 
 
-def _indexed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
-    """Yield each input, the names of its entries, and the index of its first entry in u."""
+def _mounted(
+    robot: Robot,
+) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int]]:
+    """Yield each thruster and wheel: its index in `inputs`, itself, its names, its index in u."""
     first = 0
-    for item, names in named_inputs(robot.inputs):
-        yield item, names, first
+    for place, (item, names) in enumerate(named_inputs(robot.inputs)):
+        if isinstance(item, Thruster | ReactionWheel):
+            yield place, item, names, first
         first += len(names)

@@ -1,7 +1,5 @@
 """Computation of runs in chunks: eight at a time in compiled code, or one by one in Python."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -21,19 +19,12 @@ from fflin.batch.files import MemoryStore
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.campaign.dispersions import Dispersions
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import (
-    KINDS,
-    LOOK,
-    Judge,
-    RunStatistics,
-    errors_of,
-    outcome_of,
-)
+from fflin.campaign.statistics import LOOK, Judge, RunStatistics, errors_of, outcome_of
 from fflin.control.channel import Saturation
 from fflin.dynamics.coordinates import states_of
-from fflin.kernel.tree import LANES, batch_tree
+from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import SLOTS, LaneLoop, Runs, engine_of, noises, packed, recorded
+from fflin.simulation.lanes import SLOTS, LaneLoop, engine_of, noises, packed, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.run import Recording, go, stop_conditions
@@ -72,6 +63,8 @@ class CampaignJob:
             self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.judge, self.plant, times = judge, self.plan.plant, self.plan.times
         self.engine, state = engine_of(engine, self.plan, many=True), self.plant.state
+        self.threaded = self.engine == "compiled"
+        self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx).
         self.target, self._path = self.x0 if self.plan.target is None else self.plan.target, []
@@ -87,38 +80,21 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # Shape per run of each array of an outcome: those of `Campaign`, and the state errors,
-        # which are NaN after a run was stopped.
-        nx, inputs, kinds, rows = state.nx, len(self.plan.initial), len(KINDS), len(self.steps)
-        self.outcome_shapes: dict[str, tuple[int, ...]] = {
-            **{"q": (robot.nq,), "v": (robot.nv,), "x": (nx,), "u": (inputs,)},
-            **{"largest_x": (nx,), "largest_u": (inputs,)},
-            **dict.fromkeys(("errors", "largest", "settle"), (kinds,)),
-            **{"error_history": (rows, kinds), "input_history": (rows, inputs)},
-            **{"stop": (), "end": (), "state_errors": (rows, nx)},
-        }
+        # Shapes per run: of each array of `Campaign`, with the state errors, which are NaN after a
+        # run was stopped; and of each array of the result. They follow from a run without steps.
+        start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
+        none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
+        outcome = outcome_of(self.plan, self.target, self.steps, none)
+        self.outcome_shapes = {key: values.shape for key, values in outcome.items()}
+        self.shapes: dict[str, tuple[int, ...]] = dict.fromkeys(judge.fields if judge else (), ())
+        if judge is None:
+            self.shapes |= self.outcome_shapes
+            del self.shapes["state_errors"]
 
     def __reduce__(self) -> tuple[object, ...]:
         # A worker constructs the job again, because functions that are bound to a robot cannot be
         # pickled.
         return _remade, (self._again, self.engine)
-
-    @property
-    def threaded(self) -> bool:
-        """Whether threads can compute runs in parallel."""
-        return self.engine == "compiled"
-
-    @property
-    def lanes(self) -> int:
-        """Number of runs that are computed together."""
-        return LANES if self.engine == "compiled" else 1
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape per run of each array of the result."""
-        if self.judge:
-            return dict.fromkeys(self.judge.fields, ())
-        return {key: x for key, x in self.outcome_shapes.items() if key != "state_errors"}
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
         """Return the drawn values of runs start to stop - 1; see `RowsOf`."""
@@ -132,9 +108,9 @@ class CampaignJob:
         hashed. Then the digest contains the outcome of the first run instead.
         """
         if self.engine == "python":
-            return content_digest(completed(self, lambda *_: first, 1, Execution()))
+            return content_digest(completed(self, first, Execution()))
         plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
-        found: dict[str, object] = {**self._in_lanes(first), "target": self.target}
+        found: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
         if plan.noise:
             last = min(plan.times.steps, SLOTS * plan.times.sample)
             found["of sensors"] = noises(plan, len(loop.law.y), 0, last)[1]
@@ -153,9 +129,9 @@ class CampaignJob:
         if judge:
             found = {k: np.empty((len(drawn), *x)) for k, x in self.outcome_shapes.items()}
         if self.engine == "compiled":
-            runs, of = self._in_lanes(drawn), (self.plant.state, self.target, self.steps)
-            loop = LaneLoop(self.plan, runs)
-            statistics = RunStatistics(self.plan, *of, self._path, judge and judge.over)
+            runs = self.dispersions.in_lanes(drawn)
+            loop, over = LaneLoop(self.plan, runs), judge and judge.over
+            statistics = RunStatistics(self.plan, self.target, self.steps, self._path, over)
             for first in range(0, len(drawn), LANES):
                 eight, their_out = (
                     {key: each[first : first + LANES] for key, each in arrays.items()}
@@ -171,11 +147,6 @@ class CampaignJob:
             for key, values in judge.figures(found).items():
                 out[key][:] = values
         return []
-
-    def _in_lanes(self, drawn: Array) -> Runs:
-        tree = batch_tree(self.plant.robot)
-        assert tree is not None
-        return self.dispersions.in_lanes(drawn, tree)
 
     def plan_of(self, drawn: Array) -> Plan:
         """Return the plan of a run (k,)."""
@@ -200,7 +171,7 @@ class CampaignJob:
                 return float(not (looks and over(first, errors(q, v))[0]))
 
             plan = plan.replace(events=(stops,))
-        return outcome_of(plan, state, self.target, self.steps, _recorded(plan, every=1))
+        return outcome_of(plan, self.target, self.steps, _recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
@@ -226,7 +197,7 @@ class CampaignJob:
         if self.engine == "python":
             run = _recorded(plan, plan.times.every)
         else:
-            run = recorded(self.plan, self._in_lanes(drawn[None]))
+            run = recorded(self.plan, self.dispersions.in_lanes(drawn[None]))
         return replace(motion_of(plan, run), _nominal=self.plant.robot.urdf_sha256)
 
 
@@ -275,18 +246,10 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
 
 
 def completed(
-    job: CampaignJob,
-    drawn: Callable[[int, int], Array],
-    count: int,
-    how: Execution,
-    progress: Progress | None = None,
+    job: CampaignJob, drawn: Array, how: Execution, progress: Progress | None = None
 ) -> dict[str, Array]:
-    """Run a job and return its arrays; `drawn` returns the values of runs start to stop - 1."""
+    """Run a job with drawn values (N, k), and return its arrays."""
+    count = len(drawn)
     store = MemoryStore(count, chunk_size(count, how.count(job), job.lanes), job.shapes)
-
-    def rows(start: int, stop: int) -> dict[str, Array]:
-        return {"drawn": drawn(start, stop)}
-
-    if failed := run_chunks(job, rows, store, how, progress, all_needed=True):
-        raise FflinError(failed[0][2])
+    run_chunks(job, lambda start, stop: {"drawn": drawn[start:stop]}, store, how, progress)
     return store.arrays

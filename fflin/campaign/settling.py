@@ -4,8 +4,6 @@ The norm is the square root of a Lyapunov function of the linear loop. The rate 
 minus a quadratic form in units of energy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from fflin.analysis.mechanics import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Indices, Mask, as_double, instance
+from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
 from fflin.campaign.statistics import EDGE, Judge
@@ -206,24 +204,18 @@ def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[
 
 def settle(
     runs_of: Callable[..., CampaignJob],
-    starts: Callable[[Indices], Array],
-    count: int,
+    starts: Array,
     how: Execution,
     progress: Progress | None = None,
 ) -> dict[str, Array]:
     """Return the results of runs; diverging runs are repeated with shorter steps.
 
-    `runs_of(fine=k)` creates the runs after k step reductions. `starts` returns the initial
-    deviations (N, nx) of runs (N,).
+    `runs_of(fine=k)` creates the runs after k step reductions. `starts` (N, nx) are the initial
+    deviations.
     """
-    arrays, left = dict[str, Array](), np.arange(count)
+    arrays, left = dict[str, Array](), np.arange(len(starts))
     for fine in range(_FINEST + 1):
-
-        def drawn(start: int, stop: int, left: Indices = left) -> Array:
-            return starts(left[start:stop])
-
-        told = None if fine else progress
-        found = completed(runs_of(fine=fine), drawn, len(left), how, told)
+        found = completed(runs_of(fine=fine), starts[left], how, None if fine else progress)
         for key, values in found.items():
             arrays.setdefault(key, values)[left] = values
         left = left[found["outcome"] == OUTCOMES.index("diverged")]

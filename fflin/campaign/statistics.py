@@ -3,8 +3,6 @@
 Their size does not depend on the duration of the run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
@@ -89,9 +87,7 @@ def errors_of(state: StateMap, target: Array, q: Array, v: Array) -> tuple[Array
     return x, e
 
 
-def outcome_of(
-    plan: Plan, state: StateMap, target: Array, steps: Array, run: Recording
-) -> dict[str, Array]:
+def outcome_of(plan: Plan, target: Array, steps: Array, run: Recording) -> dict[str, Array]:
     """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
 
     The outcome also has the state errors at the times of the histories.
@@ -99,8 +95,8 @@ def outcome_of(
     Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx). Histories
     have entries at `steps`.
     """
-    count, kind = len(run.q), kinds_of(state)
-    target = target[:count] if target.ndim == 2 else target
+    count, state = len(run.q), plan.plant.state
+    kind, target = kinds_of(state), target[:count] if target.ndim == 2 else target
     x, signed = errors_of(state, target, run.q, run.v)
     e, u = np.where(kind < 0, 0.0, np.abs(signed)), np.abs(run.u)
     others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
@@ -131,67 +127,59 @@ def outcome_of(
     )
 
 
-def marks_of(
-    plan: Plan, state: StateMap, target: Array, steps: Array, path: Sequence[Array]
-) -> loop.RunStatistics:
-    """Return the arrays that the kernel's run statistics read and write.
+class RunStatistics(Statistics):
+    """Statistics of eight parallel runs in compiled code.
 
     Errors are relative to the state `target` (nx,), or to a moving state (steps + 1, nx) whose q
     and nu are the arrays of `path`. Histories have entries at `steps`.
     """
-    robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
-    first = target if target.ndim == 1 else target[0]
-    x, y, z = first[:3].tolist()
-    attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
-    law, marks = no_law(state, plan.initial), empty(loop.RUN_STATISTICS)
-    law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
-    q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
-    return marks._replace(
-        robot=marks.robot._replace(
-            index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
-            circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
-            scale=np.array([joint.scale for joint in robot.joints]),
-        ),
-        law=law._replace(near=first[state.groups.q_m]),
-        path=law.path,
-        x_ref=first,
-        q_ref=q_ref,
-        nu_ref=nu_ref,
-        kind=kinds_of(state),
-        settled=SETTLED,
-        tolerance=np.full(kinds, THERE),
-        steps=steps,
-        at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
-        sizes=np.zeros(kinds),
-        largest_x=np.zeros(state.nx),
-        largest_u=np.zeros(nu),
-        largest=np.zeros(kinds),
-        outside=np.full(kinds, -1.0),
-        errors=np.full(len(steps) * kinds, np.inf),
-        inputs=np.zeros(len(steps) * nu),
-        states=np.full(len(steps) * state.nx, np.nan),
-    )
-
-
-class RunStatistics(Statistics):
-    """Statistics of eight parallel runs in compiled code; see `marks_of`."""
 
     span = LOOK
 
     def __init__(
         self,
         plan: Plan,
-        state: StateMap,
         target: Array,
         steps: Array,
         path: Sequence[Array],
         over: Over | None = None,
     ) -> None:
-        self._dt, self._state, self._target, self._steps = plan.times.dt, state, target, steps
-        self._over = over
+        self._dt, self._state, self._over = plan.times.dt, (state := plan.plant.state), over
+        self._target, self._steps = target, steps
         if over is None:
             self.span = _LONG
-        marks = marks_of(plan, state, target, steps, path)
+        robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
+        first = target if target.ndim == 1 else target[0]
+        x, y, z = first[:3].tolist()
+        attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
+        law, marks = no_law(state, plan.initial), empty(loop.RUN_STATISTICS)
+        law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
+        q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
+        marks = marks._replace(
+            robot=marks.robot._replace(
+                index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
+                circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+                scale=np.array([joint.scale for joint in robot.joints]),
+            ),
+            law=law._replace(near=first[state.groups.q_m]),
+            path=law.path,
+            x_ref=first,
+            q_ref=q_ref,
+            nu_ref=nu_ref,
+            kind=kinds_of(state),
+            settled=SETTLED,
+            tolerance=np.full(kinds, THERE),
+            steps=steps,
+            at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
+            sizes=np.zeros(kinds),
+            largest_x=np.zeros(state.nx),
+            largest_u=np.zeros(nu),
+            largest=np.zeros(kinds),
+            outside=np.full(kinds, -1.0),
+            errors=np.full(len(steps) * kinds, np.inf),
+            inputs=np.zeros(len(steps) * nu),
+            states=np.full(len(steps) * state.nx, np.nan),
+        )
         self._fresh: list[tuple[Array, Array]] = []
         self._marks = laid_out(marks, loop.RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self._marks, loop.RUN_STATISTICS)

@@ -1,7 +1,5 @@
 """Validity of a linear model: its prediction error, and settling of its closed loop."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from concurrent.futures import Executor
@@ -17,7 +15,6 @@ from fflin.base.validation import Array, FrozenArrays, Indices, number, share, w
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
-from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -235,33 +232,32 @@ def validity(
     how = Execution(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
 
-    def displaced(levels: Array, streams: Indices, runs: Indices) -> Array:
-        """Return the initial deviations of some runs, each from its own random stream."""
+    def displaced(levels: Array, streams: Indices) -> Array:
+        """Return the initial deviations of runs, each from its own random stream."""
         x = []
-        for level, stream in zip(levels[runs].tolist(), streams[runs].tolist(), strict=True):
+        for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
             x.append(loop.displaced(rng, **_scaled(largest, level)))
         return np.array(x) - loop.start
 
-    sets, work = [], []
-    # Level and random stream of each run: the runs for the prediction error, then the random runs.
-    for predicts, at, streams in (
-        (True, np.tile(_LEVELS, _DIRECTIONS), np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))),
-        (False, levels, _DIRECTIONS + np.arange(samples)),
-    ):
-        runs_of = partial(settling_runs, loop, predicts, limits, largest["joint"], engine)
-        starts = partial(displaced, at, streams)
-        sets.append((runs_of, starts, len(at)))
-        # A random run usually settles after 1 / PATIENCE of its longest duration.
-        long = len(at) if predicts else math.ceil(len(at) / PATIENCE)
-        work.append((runs_of(), starts(np.arange(min(LANES, len(at)))), long))
-    total, done, found = sum(count for *_, count in sets), 0, []
+    streams = np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))
+    # Runs for the prediction error, and random runs.
+    sets = [
+        (partial(settling_runs, loop, predicts, limits, largest["joint"], engine), starts)
+        for predicts, starts in (
+            (True, displaced(np.tile(_LEVELS, _DIRECTIONS), streams)),
+            (False, displaced(levels, _DIRECTIONS + np.arange(samples))),
+        )
+    ]
+    total, done, found = sum(len(starts) for _, starts in sets), 0, []
     with how:
-        expect(progress, work, how)
-        for runs_of, starts, count in sets:
+        # A random run usually settles after 1 / PATIENCE of its longest duration.
+        counts = len(streams), math.ceil(samples / PATIENCE)
+        expect(progress, [(of(), x, n) for (of, x), n in zip(sets, counts, strict=True)], how)
+        for runs_of, starts in sets:
             told = progress and partial(_report, progress, done, total)
-            found.append(settle(runs_of, starts, count, how, told))
-            done += count
+            found.append(settle(runs_of, starts, how, told))
+            done += len(starts)
     predicted, random = found
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])

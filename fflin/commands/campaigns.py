@@ -14,10 +14,9 @@ import fflin
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import Progress
 from fflin.base.tables import folded
+from fflin.commands.control import along, check_pictures, designed, loop_of, pictures
 from fflin.commands.points import limits_of_options, load_robot, once, reference_of, state_of
-from fflin.commands.regulator import designed
 from fflin.commands.results import Report
-from fflin.commands.simulation import along, check_pictures, loop_of, pictures
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -135,12 +134,12 @@ def sweep(arguments: Namespace) -> Report:
     example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
     """
     from fflin.batch.files import part_of
-    from fflin.batch.sweep import planned_bytes
+    from fflin.batch.sweep import ChunkJob
 
     path, robot = arguments.output_file, load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
     q, v, u = _points(robot, arguments)
-    size = planned_bytes(robot, len(q), at_rest=v is None and u is None, **settings)
+    size = len(q) * ChunkJob(robot, at_rest=v is None and u is None, **settings).row_bytes
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"

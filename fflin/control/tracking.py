@@ -1,7 +1,5 @@
 """Trajectory tracking: feedback of the state or of the outputs along a trajectory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

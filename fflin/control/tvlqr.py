@@ -6,7 +6,6 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -14,11 +13,10 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.record import Design
 from fflin.base.tables import folded
-from fflin.base.validation import Array, instance, number
+from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
@@ -35,12 +33,12 @@ from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Schedule(Design):
+class Schedule(ModelDesign):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
-    t: Array
+    t: Vector
     P: Array
-    dt: float
+    residual: float
 
     @cached_property
     def starts(self) -> list[float]:
@@ -102,20 +100,12 @@ class GainSchedule(Schedule):
     >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
     """
 
-    VECTORS: ClassVar = ("t", "knots")
-
     K: Array
-    A: Array
-    B: Array
     Q: Array
     R: Array
     Qf: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    robot: str
     weights: str
-    knots: Array
+    knots: Vector
     q: Array
     v: Array
     u: Array
@@ -233,21 +223,13 @@ class FilterSchedule(Schedule):
     (0.1, (18, 18))
     """
 
-    VECTORS: ClassVar = ("t",)
-
     L: Array
-    A: Array
-    B: Array
     C: Array
     D: Array
     y: Array
     W: Array
     V: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    robot: str
 
     def gain(self, t: float) -> Array:
         """Return L (nx, ny) of the most recent sample at time t."""

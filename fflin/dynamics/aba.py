@@ -29,7 +29,7 @@ class Aba:
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
         """Return dv/dt (nv,) in Pinocchio's order for u in base axes and an extra force tau."""
-        forces = self.actuation.torques(u)
+        forces = self.actuation.fixed @ u
         if self._resists:
             forces += self._passive_force(q, v)
         if tau is not None:
@@ -68,7 +68,7 @@ class Aba:
         # includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
-        tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field
+        tau, field = state.lift(self.actuation.fixed @ u + self._passive_force(q, v)), self.field
         here = q, v
         if field:
             q, v = field.near(q, v)
@@ -95,8 +95,7 @@ class Aba:
             field.add_turning(*here, by_q, by_v)
         at_rest = np.zeros_like(v)
         by_u = []
-        for unit in np.eye(len(u)):
-            forces = self.actuation.torques(unit)
+        for unit, forces in zip(np.eye(len(u)), self.actuation.fixed.T, strict=True):
             wrenches = self.actuation.wrenches(unit) or self._none
             rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
             by_u.append(state.velocities(rate))
@@ -104,10 +103,8 @@ class Aba:
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return the wrenches on the links: of inputs, gyroscopic torques and gravity gradient."""
-        stored, wrenches = (
-            self.state.robot.stored_momentum,
-            self.actuation.wrenches(u) or self._none,
-        )
+        stored, wrenches = self.state.robot.stored_momentum, self.actuation.wrenches(u)
+        wrenches = wrenches or self._none
         if not (stored or self.field):
             return wrenches
         total = pin.StdVec_Force(wrenches)

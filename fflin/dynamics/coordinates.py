@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast, get_args
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import rotation as turning
 from fflin.base.errors import InputError
-from fflin.base.rotation import (
-    conjugate,
-    product,
-    product_matrix,
-    quaternion_product,
-    rotation_matrices,
-    rotation_matrix,
-    skew,
-)
+from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array, Indices
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import Robot
@@ -83,26 +76,22 @@ class Groups(NamedTuple):
     qdot_m: slice
 
 
+def _axes_of(**units: str) -> dict[str, str]:
+    """Return the names and units of the x, y and z components of vectors as {name: unit}."""
+    return {f"{name}.{axis}": unit for name, unit in units.items() for axis in "xyz"}
+
+
 def state_units(robot: Robot) -> dict[str, str]:
     """Return the names and units of the 12 + 2n states as {name: unit}."""
-    units = dict.fromkeys(("q_b.x", "q_b.y", "q_b.z"), "1")
-    units |= dict.fromkeys(("r_b.x", "r_b.y", "r_b.z"), "m")
-    for joint in robot.joints:
-        units[f"q_m.{joint.name}"] = joint.unit
-    units |= dict.fromkeys(("omega_b.x", "omega_b.y", "omega_b.z"), "rad/s")
-    units |= dict.fromkeys(("v_b.x", "v_b.y", "v_b.z"), "m/s")
-    for joint in robot.joints:
-        units[f"qdot_m.{joint.name}"] = f"{joint.unit}/s"
-    return units
+    q_m = {f"q_m.{joint.name}": joint.unit for joint in robot.joints}
+    qdot_m = {f"qdot_m.{joint.name}": f"{joint.unit}/s" for joint in robot.joints}
+    return _axes_of(q_b="1", r_b="m") | q_m | _axes_of(omega_b="rad/s", v_b="m/s") | qdot_m
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
     """Return the names and units of the 6 + n generalised forces as {name: unit}."""
-    units = dict.fromkeys(("tau_b.x", "tau_b.y", "tau_b.z"), BaseTorque.UNIT)
-    units |= dict.fromkeys(("F_b.x", "F_b.y", "F_b.z"), BaseForce.UNIT)
-    for joint in robot.joints:
-        units[f"tau_m.{joint.name}"] = joint.force_unit
-    return units
+    tau_m = {f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints}
+    return _axes_of(tau_b=BaseTorque.UNIT, F_b=BaseForce.UNIT) | tau_m
 
 
 # If q0 = sqrt(1 - |q_b|^2) is below the square root of the machine epsilon, it has no correct
@@ -154,10 +143,6 @@ class Chart:
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
         return 0.5 * omega if self.standing else times(self.N, omega)
-
-    def rotated(self, vectors: Array) -> Array:
-        """Rotate vectors (.., 3) from base axes to reference axes."""
-        return vectors if self.standing else times(self.R, vectors)
 
     def turned(self, columns: Array) -> Array:
         """Rotate columns (.., 3, k) from base axes to reference axes."""
@@ -249,7 +234,7 @@ def readout(
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(gains, ends, axis=1)
     at = state.origin
     of_q[:, :3] = -K[:, g.r_b] @ at.rotation
-    turn = product_matrix(state.origin_quaternion)
+    turn = turning.product_matrix(state.origin_quaternion)
     of_q[:, 3:7] = -K[:, g.q_b] @ turn[:3]
     constant[:, 0] = offset - K[:, g.r_b] @ at.translation
     of_q_m = -K[:, g.q_m]
@@ -257,12 +242,9 @@ def readout(
     of_q[:, cos] = 0.0
     of_angles[:] = of_q_m[:, circling]
     of_rates = -K[:, 6 + robot.n :].copy()
-    for part, turned, of_part in zip(
-        (ANGULAR, LINEAR), state.axes, (of_angular, of_linear), strict=True
-    ):
-        if turned:
-            of_part[:] = of_rates[:, part] @ at.rotation
-            of_rates[:, part] = 0.0
+    for part, of_part in compress(((ANGULAR, of_angular), (LINEAR, of_linear)), state.axes):
+        of_part[:] = of_rates[:, part] @ at.rotation
+        of_rates[:, part] = 0.0
     of_v[:] = state.lift(of_rates.T).T
 
     z = np.zeros(gains.shape[1])
@@ -366,7 +348,7 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     """Return the error (nx,) from a moving reference, in its axes."""
     g = state.groups
     e = np.empty(state.nx)
-    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])
     e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
     e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
     e[g.q_m] = state.joints_apart(q_star, q)

@@ -34,6 +34,10 @@ class Integrator:
     # Stage from whose configuration each displacement starts: 0 for the first stage (the beginning
     # of the step), 1 for the second.
     origins: ClassVar[tuple[int, ...]]
+    # Weights of h v and h^2 l1, h^2 l2, ... in the displacement to each new q.
+    displacements: ClassVar[tuple[tuple[float, ...], ...]]
+    # Weights of v and h l1, h l2, ... in each new v.
+    speeds: ClassVar[tuple[tuple[float, ...], ...]]
 
     def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
         self.model, self.dt = model, dt
@@ -45,7 +49,11 @@ class Integrator:
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
         """Return the weights of v and the stages' accelerations l for each new q and each new v."""
-        raise NotImplementedError
+        displacement, speed = np.array(cls.displacements), np.array(cls.speeds)
+        displacement[:, 0] *= dt
+        displacement[:, 1:] *= dt * dt
+        speed[:, 1:] *= dt
+        return displacement, speed
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
@@ -71,25 +79,19 @@ class CommutatorFree4(Integrator):
     moments = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0)
     reach = 2.78
     origins = (0, 0, 1, 0)
-
-    @classmethod
-    def step_weights(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and of the accelerations l1, ..., l4 of the stages."""
-        h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
-        displacement = [
-            [half, 0.0, 0.0, 0.0, 0.0],
-            [half, half * half, 0.0, 0.0, 0.0],
-            [half, 0.0, h * half, 0.0, 0.0],
-            [half, twelfth, twelfth, -twelfth, 0.0],
-            [half, twelfth, twelfth, 3.0 * twelfth, 0.0],
-        ]
-        speed = [
-            [1.0, half, 0.0, 0.0, 0.0],
-            [1.0, 0.0, half, 0.0, 0.0],
-            [1.0, 0.0, 0.0, h, 0.0],
-            [1.0, *(h * weight for weight in cls.weights)],
-        ]
-        return np.array(displacement), np.array(speed)
+    displacements = (
+        (0.5, 0.0, 0.0, 0.0, 0.0),
+        (0.5, 0.25, 0.0, 0.0, 0.0),
+        (0.5, 0.0, 0.5, 0.0, 0.0),
+        (0.5, 1.0 / 12.0, 1.0 / 12.0, -1.0 / 12.0, 0.0),
+        (0.5, 1.0 / 12.0, 1.0 / 12.0, 0.25, 0.0),
+    )
+    speeds = (
+        (1.0, 0.5, 0.0, 0.0, 0.0),
+        (1.0, 0.0, 0.5, 0.0, 0.0),
+        (1.0, 0.0, 0.0, 1.0, 0.0),
+        (1.0, *weights),
+    )
 
 
 class SemiImplicitEuler(Integrator):
@@ -98,11 +100,7 @@ class SemiImplicitEuler(Integrator):
     nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
     origins = (0,)
-
-    @classmethod
-    def step_weights(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and of its derivative."""
-        return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
+    displacements, speeds = ((1.0, 1.0), (0.0, 0.0)), ((1.0, 1.0),)
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {

@@ -37,12 +37,7 @@ _DENSE_SIZE = 64
 
 # Looked up once, because looking up a name in a module takes as long as factorising a small
 # matrix.
-_crba, _decompose, _invert_factor, _compute_inverse = (
-    pin.crba,
-    pin.cholesky.decompose,
-    pin.cholesky.computeMinv,
-    pin.computeMinverse,
-)
+_crba, _compute_inverse, _cholesky = pin.crba, pin.computeMinverse, pin.cholesky
 
 
 class Inertia:
@@ -61,10 +56,8 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides: list[int] = []
-        for joint in robot.joints:
-            if joint.prismatic and joint.kind != "modal":
-                self._slides.append(joint.idx_q)
+        slides = [joint for joint in robot.joints if joint.prismatic and joint.kind != "modal"]
+        self._slides = [joint.idx_q for joint in slides]
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -97,8 +90,8 @@ class Inertia:
             _invert_dense(M, out)
             coupling = M.diagonal().dot(out.diagonal())
         else:
-            _decompose(self._model, self._data)
-            inverse = _invert_factor(self._model, self._data)
+            _cholesky.decompose(self._model, self._data)
+            inverse = _cholesky.computeMinv(self._model, self._data)
             self._state.project(inverse, out)
             coupling = upper.diagonal().dot(inverse.diagonal())
         # A zero pivot gives NaN, which this condition also reports.
@@ -216,9 +209,7 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored: list[tuple[int, Array]] = []
-        for joint, momentum in robot.stored_momentum:
-            self._stored.append((joint, skew(momentum)))
+        self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
         self._field = state.field
         self._still = np.zeros(robot.nv)
 

@@ -16,7 +16,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, Indices, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
-from fflin.dynamics.orbital import OrbitField
+from fflin.dynamics.orbital import field_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
@@ -102,16 +102,10 @@ class StateMap:
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         # Acceleration field of the robot's orbit; None without an orbit.
-        self.field = OrbitField(robot, self.frame) if robot.orbit else None
+        self.field = field_of(robot, self.frame)
         self.nx = 12 + 2 * n
-        self.groups = names.Groups(
-            q_b=slice(0, 3),
-            r_b=slice(3, 6),
-            q_m=slice(6, 6 + n),
-            omega_b=slice(6 + n, 9 + n),
-            v_b=slice(9 + n, 12 + n),
-            qdot_m=slice(12 + n, 12 + 2 * n),
-        )
+        ends = 3, 6, 6 + n, 9 + n, 12 + n, self.nx
+        self.groups = names.Groups(*map(slice, (0, *ends), ends))
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state.
@@ -429,9 +423,9 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups: dict[str, Indices] = {}
-        for group in dict.fromkeys(groups):
-            self.groups[group] = np.flatnonzero(np.array(groups) == group)
+        self.groups: dict[str, Indices] = {
+            group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
+        }
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
@@ -441,11 +435,10 @@ class Actuation:
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
-        self._of_carried: list[int] = []
         for joint, items in carried.items():
             places, wrenches = zip(*items, strict=True)
             self.wrench_columns.append((joint, np.array(places), np.column_stack(wrenches)))
-            self._of_carried += places
+        self._of_carried = [at for items in carried.values() for at, _ in items]
         self.carried = bool(carried)  # whether columns depend on the configuration
 
     def columns(self, data: pin.Data, q: Array) -> Array:
@@ -467,10 +460,6 @@ class Actuation:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]
 
-    def turn_columns(self, chart: Chart, by_u: Array) -> None:
-        """Convert derivatives (.., k, nu) over inputs in base axes to derivatives over u (4.7)."""
-        chart.turn_columns(self.held, by_u)
-
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return each joint's wrench of thrusters and wheels in its frame; None without any."""
         if not self.carried:
@@ -479,7 +468,3 @@ class Actuation:
         for joint, inputs, wrenches in self.wrench_columns:
             external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
         return external
-
-    def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) of the inputs that are not in `wrenches`."""
-        return self.fixed @ u

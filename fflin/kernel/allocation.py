@@ -13,12 +13,12 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel import lanes
+from fflin.base.validation import Array
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
-from fflin.kernel.lanes import called, load, root, store
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
+from fflin.kernel.vectors import called, load, root, store
 
 # Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
 # smallest.
@@ -55,6 +55,84 @@ class Allocation(namedtuple("Allocation", "asking giving point work problem")):
 LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
 _ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
 ALLOCATION = Struct(Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES)
+
+
+# For arrays of numbers. Compiled code uses the loops in `LOOPS` in place of NumPy.
+def row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
+    """Return the scalar product of `count` entries of two arrays of numbers."""
+    return a[first : first + count].dot(b[second : second + count])
+
+
+def add_row(a: Array, first: int, factor: float, b: Array, second: int, count: int) -> None:
+    """Add `factor` times `count` entries of b, from `second` on, to entries of a."""
+    a[first : first + count] += factor * b[second : second + count]
+
+
+def row_products(a: Array, size: int, b: Array, out: Array) -> None:
+    """Write the scalar product of each row of `size` entries of a with the first entries of b."""
+    np.dot(a.reshape(len(out), size), b[:size], out)
+
+
+def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
+    """Make x orthogonal to the first `count` rows of Q, and write its components along them."""
+    basis = Q[: count * size].reshape(count, size)
+    components = basis.dot(x)
+    x -= components.dot(basis)
+    # Orthogonalise twice, because rounding errors leave part of the components after the first
+    # pass.
+    rest = basis.dot(x)
+    x -= rest.dot(basis)
+    np.add(components, rest, found[first : first + count])
+
+
+def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None:
+    """Write `factor` times the first entries of one lane of `source` into `target`."""
+    target[:] = factor * source[: len(target)]
+
+
+@called
+def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
+    total = 0.0
+    for index in range(count):
+        total += a[first + index] * b[second + index]
+    return total
+
+
+@called
+def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: int) -> None:
+    for index in range(count):
+        a[first + index] += share * b[second + index]
+
+
+@called
+def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
+    for index in range(len(out)):
+        out[index] = _row_product(a, index * size, b, 0, size)
+
+
+@called
+def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
+    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
+    # the least squares solution is as accurate as with Householder's method.
+    for index in range(count):
+        share = _row_product(Q, index * size, x, 0, size)
+        _add_row(x, 0, -share, Q, index * size, size)
+        found[first + index] = share
+
+
+@called
+def _write_scaled(source: Array, lane: int, share: float, target: Array) -> None:
+    for index in range(len(target)):
+        target[index] = share * vec.peek(source, index, lane)
+
+
+vec.LOOPS |= {
+    row_product: _row_product,
+    row_products: _row_products,
+    add_row: _add_row,
+    remove_components: _remove_components,
+    write_scaled: _write_scaled,
+}
 
 
 def least_squares(least, most, size):
@@ -119,10 +197,10 @@ def _realise(allocation, point, commanded):
         for k in range(size):
             pivot, at = load(work, tree.scaled + tree.row[k] + tree.depth[k]), column * size + k
             store(columns, at, load(columns, at) * root(pivot))
-    for lane in range(lanes.width(point.u)):
+    for lane in range(vec.lane_count(point.u)):
         solve(problem, size, lane)
         for index in range(count):
-            lanes.poke(point.u, index, lane, problem.x[index])
+            vec.poke(point.u, index, lane, problem.x[index])
 
 
 @called
@@ -130,10 +208,10 @@ def solve(problem, size, lane):
     """Write the solution of one lane into x; x is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count, given = problem.least, problem.most, len(problem.least), problem.given
-    lanes.write_scaled(problem.columns, lane, 1.0, given)
+    write_scaled(problem.columns, lane, 1.0, given)
     last = count * size
-    unit = root(lanes.row_product(given, 0, given, 0, last))
-    force = root(lanes.row_product(given, last, given, last, size))
+    unit = root(row_product(given, 0, given, 0, last))
+    force = root(row_product(given, last, given, last, size))
     nothing = not (unit > 0.0 and force > 0.0)
     scale = 1.0 if nothing else unit / force
     free = 0
@@ -146,15 +224,15 @@ def solve(problem, size, lane):
             problem.order[free] = j
             free += 1
     if not nothing:
-        lanes.write_scaled(given, 0, 1.0 / unit, A)
-        lanes.write_scaled(given[last:], 0, 1.0 / force, wanted)
+        write_scaled(given, 0, 1.0 / unit, A)
+        write_scaled(given[last:], 0, 1.0 / force, wanted)
         free, kept = _solve_scaled(problem, size, free, 0)
         # Remove the part of the force that the inputs cannot produce, because its rounding error
         # would exceed the rows of LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
-                lanes.add_row(wanted, 0, x[j], A, j * size, size)
+                add_row(wanted, 0, x[j], A, j * size, size)
         _solve_scaled(problem, size, free, kept)
     for j in range(count):
         x[j] = min(max(x[j] / scale, least[j]), most[j]) + 0.0 * force
@@ -220,35 +298,35 @@ def _fit(problem, size, free, kept):
     rows = size + count
     # The residual without the free inputs: `wanted` minus the force of the inputs at their bounds.
     b[:] = 0.0
-    lanes.write_scaled(problem.wanted, 0, 1.0, b[:size])
+    write_scaled(problem.wanted, 0, 1.0, b[:size])
     for j in range(count):
         if problem.state[j] != _FREE and x[j] != 0.0:
             b[size + j] = -LEAST * x[j]
-            lanes.add_row(b, 0, -x[j], A, j * size, size)
+            add_row(b, 0, -x[j], A, j * size, size)
     # Each new column of the factor is orthogonal to the columns before it.
     for at in range(kept, free):
         j = order[at]
         column = Q[at * rows : (at + 1) * rows]
         column[:] = 0.0
-        lanes.write_scaled(A[j * size :], 0, 1.0, column[:size])
+        write_scaled(A[j * size :], 0, 1.0, column[:size])
         column[size + j] = LEAST
-        lanes.remove_components(Q, rows, at, column, R, at * count)
-        length = root(lanes.row_product(column, 0, column, 0, rows))
-        lanes.write_scaled(column, 0, 1.0 / length, column)
+        remove_components(Q, rows, at, column, R, at * count)
+        length = root(row_product(column, 0, column, 0, rows))
+        write_scaled(column, 0, 1.0 / length, column)
         R[at * count + at] = length
-    lanes.remove_components(Q, rows, free, b, y, 0)
+    remove_components(Q, rows, free, b, y, 0)
     for at in range(free - 1, -1, -1):
         value = y[at] / R[at * count + at]
         s[order[at]] = value
         if at > 0:
-            lanes.add_row(y, 0, -value, R, at * count, at)
+            add_row(y, 0, -value, R, at * count, at)
 
 
 @called
 def _steepest(problem, size):
     """Return the untried input whose release reduces the error fastest, or -1 without one."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
-    lanes.row_products(problem.A, size, b, slopes)
+    row_products(problem.A, size, b, slopes)
     for j in range(len(state)):
         if state[j] == _LOW or state[j] == _HIGH:
             slope = LEAST * b[size + j] + slopes[j]

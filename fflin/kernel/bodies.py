@@ -12,8 +12,8 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sect
 """
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.lanes import load, splat, store
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
+from fflin.kernel.vectors import load, splat, store
 
 # Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
 # by c alone, and Psi''.

@@ -22,8 +22,6 @@ S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of r
 using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 """
 
-from collections import namedtuple
-
 import numpy as np
 
 from fflin.base.validation import Array, Mask
@@ -34,8 +32,8 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
-from fflin.kernel.lanes import compiled, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
+from fflin.kernel.vectors import compiled, load, splat, store
 
 
 def _coriolis(work, at, w):
@@ -169,6 +167,7 @@ def _unpack(work, start, entries, out, first, offset):
 def derive(tree, points, out, lanes, work):
     """Write the results of `RowAccelerations` at eight or more points, which may be at rest."""
     q, nu, force, u = points
+    q_lanes, nu_lanes, force_lanes, u_lanes = lanes
     c, A, by_u, judged = out
     size = len(tree.row)
     slopes, moves = tree.size, len(nu) > 0
@@ -178,15 +177,15 @@ def derive(tree, points, out, lanes, work):
         # If the last block has fewer than eight points, it overlaps the block before and fills all
         # lanes.
         first = min(block, len(q) - LANES)
-        _pack(q, first, lanes.q)
-        bodies.outwards(work, tree, lanes.q)
+        _pack(q, first, q_lanes)
+        bodies.outwards(work, tree, q_lanes)
         if moves:
-            _pack(nu, first, lanes.nu)
-            _pack(force, first, lanes.force)
-            _pack(u, first, lanes.u)
-            bodies.move_bodies(work, tree, lanes.nu)
+            _pack(nu, first, nu_lanes)
+            _pack(force, first, force_lanes)
+            _pack(u, first, u_lanes)
+            bodies.move_bodies(work, tree, nu_lanes)
             bodies.load_bodies(work, tree)
-            bodies.load_carried(work, tree, lanes.u)
+            bodies.load_carried(work, tree, u_lanes)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
         for k in range(size):  # `factorise` overwrites the diagonal of the packed M
@@ -197,7 +196,7 @@ def derive(tree, points, out, lanes, work):
             bodies.collect(work, tree)
             bodies.collect_momenta(work, tree)
             for index in range(size):
-                value = load(lanes.force, index) - load(work, tree.bias + index)
+                value = load(force_lanes, index) - load(work, tree.bias + index)
                 store(work, tree.c + index, value)
             bodies.solve(work, tree, tree.c)
         bodies.invert_factor(work, tree)
@@ -217,15 +216,12 @@ def derive(tree, points, out, lanes, work):
 _FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is accurate
 
 
-class Packed(namedtuple("Packed", "q nu force u")):
-    """Arrays of eight points; their second axis is the lane."""
-
-
 class RowAccelerations:
     """Accelerations at rows of points, their derivatives and M^-1, by the compiled kernel.
 
-    The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy at each point; see
-    `Inertia`.
+    Its methods return whether (N,) the results are accurate: M is well-conditioned and all angles
+    are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy of
+    M^-1; see `Inertia`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -235,15 +231,15 @@ class RowAccelerations:
         self._work = tree.size + nv * state.nx + nv * nu + 1
         self._least_coupling = 0.999 * nv
 
-    def write_inverse(self, q: Array, by_u: Array) -> Array:
-        """Write the derivatives over u (N, 6 + n, nu); return the sums of couplings (N,)."""
+    def write_inverse(self, q: Array, by_u: Array) -> Mask:
+        """Write the derivatives over u (N, 6 + n, nu)."""
         none = np.empty((0, 0))
         return self._derive((q, none, none, none), none, none, by_u)
 
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
-    ) -> tuple[Array, Array]:
-        """Write the derivatives of accelerations; return c (N, 6 + n) and sums of couplings (N,).
+    ) -> tuple[Array, Mask]:
+        """Write the derivatives of accelerations; return c (N, 6 + n) as well.
 
         The lower half of each A (N, nx, nx) gets the derivatives over the state. A and by_u are
         C-contiguous; nu and u are in base axes.
@@ -253,23 +249,16 @@ class RowAccelerations:
         c = np.empty(nu.shape)
         return c, self._derive((q, nu, force, u), c, A.reshape(len(q), -1), by_u)
 
-    def _derive(self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array) -> Array:
+    def _derive(self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array) -> Mask:
         judged = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,
             # numba would compile a second function for read-only arrays.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
             (c, A, by_u.reshape(len(by_u), -1), judged),
-            Packed(*map(work_space, self._sizes)),
+            tuple(map(work_space, self._sizes)),  # their second axis is the lane
             work_space(self._work),
         )
-        return judged[:, 0]
-
-    def sound(self, q: Array, judged: Array) -> Mask:
-        """Return whether (N,) M is well-conditioned and all angles are below 1e6 rad."""
         # A zero pivot gives NaN, and comparisons with NaN are false.
-        q_m = q[:, 7:]
         good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
-        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
-            return good
-        return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
+        return good[:, 0] & (np.abs(points[0][:, 7:]) < _FARTHEST).all(axis=1)

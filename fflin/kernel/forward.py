@@ -15,8 +15,8 @@ from collections import namedtuple
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
-from fflin.kernel.lanes import angle, called, chosen, load, store
 from fflin.kernel.tree import FLAGS, INDICES, LANED, REALS, TREE, Struct
+from fflin.kernel.vectors import angle, called, chosen, load, store
 
 
 class Mechanics(

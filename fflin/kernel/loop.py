@@ -12,10 +12,9 @@ from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
-from fflin.kernel.lanes import angle, below, chosen, compiled, load, peek, poke, root, store, whole
-from fflin.kernel.lanes import width as lane_count
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
+from fflin.kernel.vectors import angle, below, chosen, compiled, load, root, store, whole
 
 
 class Wheels(
@@ -87,16 +86,16 @@ def transmit(channel, step, nu, u):
     # Write the latest command that has arrived after the delay, or its pulses.
     if channel.sample > 0:
         any_fresh = False
-        for lane in range(lane_count(channel.delay)):
-            since = step - int(peek(channel.delay, 0, lane))
+        for lane in range(vec.lane_count(channel.delay)):
+            since = step - int(vec.peek(channel.delay, 0, lane))
             arrives = since >= 0 and since % channel.sample == 0
             if arrives:
                 first = (since // channel.sample) % channel.slots * count
                 for index in range(count):
-                    value = peek(channel.pending, first + index, lane)
-                    poke(channel.held, index, lane, value)
+                    value = vec.peek(channel.pending, first + index, lane)
+                    vec.poke(channel.held, index, lane, value)
             fresh = arrives or (since < 0 and step % channel.sample == 0)
-            poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
+            vec.poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
             any_fresh = any_fresh or fresh
         if any_fresh:
             _begin_pulses(channel, step, channel.held)

@@ -6,9 +6,9 @@ chain of ten calls would be compiled ten times. Here a part (a function called o
 functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
 Python calls.
 
-The operations of `kernel.lanes` are compiled for one number or for eight at once. An array with one
-axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and one
-instruction for all eight. A single double stands for eight equal numbers. So a function that is
+The operations of `kernel.vectors` are compiled for one number or for eight at once. An array with
+one axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and
+one instruction for all eight. A single double stands for eight equal numbers. So a function that is
 written for one number can be compiled for eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
@@ -41,7 +41,7 @@ from numba.core.typing.templates import AttributeTemplate, infer_global
 from numba.np.arrayobj import populate_array
 from numba.types import Array, Type, boolean, float64, intp, void
 
-from fflin.kernel import lanes as uncompiled
+from fflin.kernel import vectors as uncompiled
 from fflin.kernel.tree import LANES, Kind, Struct
 
 _DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
@@ -113,14 +113,14 @@ _arithmetic(operator.mul, ir.IRBuilder.fmul)
 _arithmetic(operator.truediv, ir.IRBuilder.fdiv)
 _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 
-# {function of `kernel.lanes`: operation that replaces it in compiled code}.
+# {function of `kernel.vectors`: operation that replaces it in compiled code}.
 OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Decorate a function that generates the code which replaces a function of `kernel.lanes`.
+    """Decorate a function that generates the code which replaces a function of `kernel.vectors`.
 
     The function gets an array as the address of its first entry, a double or a vector.
     """

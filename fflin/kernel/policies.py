@@ -7,13 +7,12 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel import lanes
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.lanes import angle, called, chosen, load, splat, store, whole
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
+from fflin.kernel.vectors import angle, called, chosen, load, splat, store, whole
 
 _NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
 
@@ -270,17 +269,15 @@ def _feed_back_between(robot, law, point):
         store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
     for index in range(inputs):
         store(u, index, 0.0)
-    for lane in range(lanes.width(u)):
+    for lane in range(vec.lane_count(u)):
         for corner in range(1 << len(grid.joint)):
             weight, cell = _corner(grid, corner, lane)
             for row in range(inputs if weight > 0.0 else 0):
                 at = cell * inputs + row
-                total = lanes.peek(grid.offset, at, lane)
+                total = vec.peek(grid.offset, at, lane)
                 for column in range(size):
-                    total -= lanes.peek(grid.K, at * size + column, lane) * lanes.peek(
-                        y, column, lane
-                    )
-                lanes.poke(u, row, lane, lanes.peek(u, row, lane) + weight * total)
+                    total -= vec.peek(grid.K, at * size + column, lane) * vec.peek(y, column, lane)
+                vec.poke(u, row, lane, vec.peek(u, row, lane) + weight * total)
 
 
 def _corner(grid, corner, lane):
@@ -288,7 +285,7 @@ def _corner(grid, corner, lane):
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1
-        value = min(max(lanes.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
+        value = min(max(vec.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
         k = first
         while k < last - 1 and value >= grid.values[k + 1]:
             k += 1

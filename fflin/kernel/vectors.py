@@ -1,17 +1,98 @@
-"""Vectors (3), spatial vectors, attitudes and displacements; entries are numbers or lanes.
+"""Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
+
+A function of the kernel is a Python function. Called directly, with arrays or lists of one axis, it
+computes one number at a time. The Python engine calls it like this, and a debugger can step through
+it. `kernel.machine_code` compiles the same function, also for arrays with a second axis of eight
+lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
 joints.
 """
 
-from math import factorial
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from fflin.kernel.lanes import floor, load, store
+from fflin.base.validation import Array
 
 _TERMS = 10  # exact to machine precision up to half a turn; a step rotates by less than a radian
+
+F = TypeVar("F", bound=Callable[..., object])
+
+# One number; in compiled code also eight lanes.
+Number: TypeAlias = float
+# Numbers in memory. The entries of a list are read faster than the entries of an array.
+Entries: TypeAlias = Array | list[Number]
+
+# {function of the kernel: how it is compiled}. All other functions are inlined in their callers.
+HOW: dict[Callable[..., object], str] = {}
+# {function that uses NumPy: loop that is compiled in its place}.
+LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
+
+
+def _decorator(how: str) -> Callable[[F], F]:
+    def noted(function: F) -> F:
+        HOW[function] = how
+        return function
+
+    return noted
+
+
+# For functions that are rarely called: inlining saves little there, and takes long to compile.
+called = _decorator("called")
+# For functions called from Python; their machine code is stored on disk.
+compiled = _decorator("compiled")
+
+floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
+
+
+def load(array: Entries, index: int) -> Number:
+    """Return an entry of an array: one number, or one number per lane."""
+    return array[index]
+
+
+def store(array: Entries, index: int, value: Number) -> None:
+    """Write a number or lanes at an index."""
+    array[index] = value
+
+
+def splat(array: Entries, value: float) -> Number:
+    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
+    return value
+
+
+def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
+    """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
+    return less if left < right else other
+
+
+def below(value: Number, bound: Number) -> bool:
+    """Return whether a number, or every lane, is less than a bound; false for NaN."""
+    return value < bound
+
+
+def peek(array: Array, index: int, lane: int) -> float:
+    """Return the value of a lane at an index."""
+    value: float = array[index] if array.ndim == 1 else array[index, lane]
+    return value
+
+
+def poke(array: Array, index: int, lane: int, value: float) -> None:
+    """Write the value of a lane at an index."""
+    if array.ndim == 1:
+        array[index] = value
+    else:
+        array[index, lane] = value
+
+
+def lane_count(array: Array) -> int:
+    """Return the number of lanes of an array, 0 if the array is empty."""
+    return array.size // max(len(array), 1)
 
 
 def get3(work, at):
@@ -154,7 +235,9 @@ def cosine_and_sine(x):
 
 def _series(first):
     """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
-    shares = [(-1) ** k * factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
+    shares = [
+        (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k) for k in range(_TERMS)
+    ]
     last, rest = shares[-1], tuple(shares[-2::-1])
 
     def series(x):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array, instance, number, shaped, vector
+from fflin.base.validation import Array, Vector, instance, number, shaped, vector
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.fit import require_fit
@@ -60,15 +60,13 @@ class ToolModel(StateSpace, Design):
     ((9, 18), ('theta.x', 'theta.y', 'theta.z'), 'fixed')
     """
 
-    VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
-
     tool: str
     robot: str
     T: Array
     T_left: Array
     T_u: Array
-    q: Array
-    v: Array
+    q: Vector
+    v: Vector
     reference: str
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Result, frozen, number, positive
+from fflin.base.validation import Array, Result, Vector, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
@@ -68,10 +68,10 @@ class StateSpace(Result):
     B: Array
     C: Array
     D: Array
-    f0: Array
-    x0: Array
-    u0: Array
-    y0: Array
+    f0: Vector
+    x0: Vector
+    u0: Vector
+    y0: Vector
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]

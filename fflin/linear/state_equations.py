@@ -3,8 +3,6 @@
 Equation numbers refer to docs/derivation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,7 +37,8 @@ def assemble(
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
-    f0 = np.concatenate((chart.rate(w), chart.rotated(v), nu[..., 6:], rates.c), -1)  # (4.8)
+    position_rate = chart.turned(v[..., None])[..., 0]
+    f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)  # (4.8)
 
     theta = _over_rotations(state, actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
@@ -65,7 +64,7 @@ def assemble(
         # The columns of the base's linear velocity are zero, so they need no rotation.
         chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
-        actuation.turn_columns(chart, rates.by_u)
+        chart.turn_columns(actuation.held, rates.by_u)
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
@@ -157,7 +156,7 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        actuation.turn_columns(chart, by_u)
+        chart.turn_columns(actuation.held, by_u)
         D[:] = by_u  # (8.3)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:

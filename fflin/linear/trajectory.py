@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +17,7 @@ from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, as_double, frozen, instance, number, vector
+from fflin.base.validation import as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
@@ -29,6 +29,7 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin import Motion
+    from fflin.base.validation import Array, Indices, Vector
 
 # Largest residual up to which knots count as a motion of the robot.
 _MOTION = 1e-2
@@ -105,10 +106,8 @@ class Trajectory(Design):
     ((11, 13), 'previous', True)
     """
 
-    VECTORS: ClassVar = ("t",)
-
     robot: Robot
-    t: Array
+    t: Vector
     q: Array
     v: Array
     u: Array

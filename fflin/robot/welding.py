@@ -1,7 +1,5 @@
 """Welding of joints at given values, and of one robot to a frame of another."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

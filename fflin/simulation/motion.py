@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,21 +13,20 @@ import pinocchio as pin
 from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import as_path, check_ending
 from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
+from fflin.linear.trajectory import Trajectory, along
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
+from fflin.robot.robot import Robot
 from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from fflin.linear.trajectory import Trajectory
-    from fflin.robot.robot import Robot
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -126,23 +125,17 @@ class Motion(Design):
     True
     """
 
-    OPEN: ClassVar = ("limits",)
-    VECTORS: ClassVar = (
-        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias", "starts"),
-        "mode_rotations",
-    )
-
-    t: Array
+    t: Vector
     q: Array
     v: Array
     x: Array
     u: Array
     target: Array
     prediction: Array
-    energy: Array
+    energy: Vector
     momentum: Array
-    momentum_drift: Array
-    placement: Array
+    momentum_drift: Vector
+    placement: Vector
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     state_units: tuple[str, ...]
@@ -151,22 +144,22 @@ class Motion(Design):
     robot: str
     urdf_sha256: str
     stopped: str
-    com_drift: Array = field(default_factory=lambda: np.zeros(0))
+    com_drift: Vector = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
     _nominal: str = field(default="", kw_only=True)  # checksum of a campaign's robot; not saved
     wheels: tuple[str, ...] = field(default_factory=tuple)
-    wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
+    wheel_inertias: Vector = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = field(default_factory=tuple)
     limit_names: tuple[str, ...] = field(default_factory=tuple)
-    limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    limits: Open = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
     phases: tuple[str, ...] = field(default_factory=tuple)
-    starts: Array = field(default_factory=lambda: np.zeros(0))
+    starts: Vector = field(default_factory=lambda: np.zeros(0))
     _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
-    mode_rotations: Array = field(default_factory=lambda: np.zeros(0))
+    mode_rotations: Vector = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -273,7 +266,36 @@ class Motion(Design):
                 "a motion that was read from a file lacks its robot; join motions returned by "
                 "simulate"
             )
-        return _joined(parts[0], parts)
+        first = parts[0]
+        whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
+        robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
+        for part in parts[1:]:
+            if isinstance(part, Impact):
+                name, (other, other_q, other_v) = part.event, part._before
+            else:
+                instance("a phase", part, Motion, "a Motion, or an Impact before one")
+                name, other, other_q, other_v = (
+                    event or part.robot,
+                    part._robot,
+                    part.q[0],
+                    part.v[0],
+                )
+            seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
+            apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
+            if apart.max() > _MET * max(1.0, np.abs(v).max()):
+                at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
+                raise InputError(
+                    f"'{name}' does not begin where the motion before it ended: "
+                    f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
+                    "start from q and v in the last row of that motion"
+                )
+            if isinstance(part, Impact):
+                robot, q, v, event = part.robot, part.q, part.v, part.event
+                whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
+            else:
+                robot, q, v, event = other, part.q[-1], part.v[-1], ""
+                whole = _longer(whole, part, name)
+        return whole
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion as a trajectory, which can be linearised or tracked.
@@ -283,8 +305,6 @@ class Motion(Design):
         extrapolated, because they are not recorded. `robot` is required only if the motion was read
         from a file.
         """
-        from fflin.linear.trajectory import along
-
         return along(self, robot or self._robot)
 
     @property
@@ -329,34 +349,6 @@ class Motion(Design):
 def require_motion(motion: object) -> Motion:
     """Return the motion, or raise `InputError` if it is not a Motion."""
     return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
-
-
-def _joined(first: Motion, parts: tuple[Motion | Impact, ...]) -> Motion:
-    """Join the parts of a motion, motions and impacts; `first` is the first part."""
-    whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
-    robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
-    for part in parts[1:]:
-        if isinstance(part, Impact):
-            name, (other, other_q, other_v) = part.event, part._before
-        else:
-            instance("a phase", part, Motion, "a Motion, or an Impact before one")
-            name, other, other_q, other_v = event or part.robot, part._robot, part.q[0], part.v[0]
-        seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
-        apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
-        if apart.max() > _MET * max(1.0, np.abs(v).max()):
-            at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
-            raise InputError(
-                f"'{name}' does not begin where the motion before it ended: "
-                f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
-                "start from q and v in the last row of that motion"
-            )
-        if isinstance(part, Impact):
-            robot, q, v, event = part.robot, part.q, part.v, part.event
-            whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
-        else:
-            robot, q, v, event = other, part.q[-1], part.v[-1], ""
-            whole = _longer(whole, part, name)
-    return whole
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:

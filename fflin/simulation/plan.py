@@ -9,16 +9,17 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, number, truth, vector, whole
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
-from fflin.control.linear_controller import closed_loop, growing
+from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
 from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
 from fflin.dynamics import points
@@ -30,9 +31,6 @@ from fflin.robot.fields import chosen_limits
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
@@ -147,7 +145,7 @@ class Plan:
         functions.append(("callback", options.callback, "(t, q, v, u)"))
         functions.append(("disturbance", options.disturbance, "(t, q, v)"))
         for name, given, arguments in functions:
-            if not (callable(given) or (given is None and name != "event")):
+            if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
         # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
@@ -176,11 +174,9 @@ class Plan:
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
-        self.charted = lin is not None  # the run ends when the base leaves the chart of the state
         self.steered = fed_back(policy)  # states that are known to be fed back
         # Measurement noise(t) of the policy, if any.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
-        self.notes = (*growing(policy), *times.notes)  # for the report
         # Time of the last stage as a fraction of the step, earlier if inputs jump at knots.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,7 +19,8 @@ from scipy.linalg.lapack import dposv
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, as_double
+from fflin.base.validation import Array, as_double, vector
+from fflin.control.policies import feedback_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
@@ -99,15 +101,11 @@ class Plant:
         force = self.actuation.columns(self._data, q) @ u
         disturbed = None
         if self.disturbance is not None:
-            name = f"disturbance(t, q, v) at t = {t:g} s"
+            name = f"at t = {t:g} s, disturbance(t, q, v)"
             disturbed = as_double(name, self.disturbance(t, q.copy(), v.copy()))
-            finite = np.isfinite(disturbed).all() or not np.abs(v).max() < _DIVERGED
-            if disturbed.shape != (self.robot.nv,) or not finite:
-                raise InputError(
-                    f"disturbance(t, q, v) returned shape {disturbed.shape} at t = {t:g} s, "
-                    f"expected ({self.robot.nv},) finite numbers: a generalised force in "
-                    "Pinocchio's order"
-                )
+            if np.abs(v).max() < _DIVERGED:
+                expected = "a generalised force (nv,) in Pinocchio's order"
+                disturbed = vector(name, disturbed, self.robot.nv, expected)
         rate = self._aba.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
         if self.field:
@@ -187,8 +185,7 @@ class Conserved:
     def center(self, t: float) -> Array:
         """Return the centre of mass (3,) relative to the point."""
         self._time[1] = t
-        position: Array = self._line.dot(self._time)
-        return position
+        return self._line.dot(self._time)
 
     def impose(self, t: float, q: Array, v: Array) -> None:
         """Set the base's position in `q` and velocity in `v` by centre of mass and momentum."""
@@ -284,7 +281,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
     channel = None if law is None else plan.channel(law, lambda t, q, v: v[plan.wheels])
-    ask = channel.ask if channel and channel.continuous else None
+    ask = partial(channel.begin, 0) if channel and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
     follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt
@@ -308,11 +305,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
             follow(weights[stages - 1, : stages + 1], stages == len(weights))
         return a
 
-    stopped, ending, bar = (
-        "",
-        ending_of(plan, stop_conditions(plan)),
-        Progress(plan.options.progress),
-    )
+    ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.options.progress)
     try:
         for step in range(times.steps):
             u = channel.begin(step, t, q, v) if channel else plan.initial
@@ -346,7 +339,9 @@ def stop_conditions(plan: Plan) -> StopConditions:
     """Return the stop conditions of a run, with squared rates in the order of v (nv,)."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = plan.times.slow
-    sign = float(np.sign(plan.plant.state.scalar(plan.q))) if plan.charted else 0.0
+    # With a model, the run ends when the base leaves the chart of the state.
+    charted = feedback_of(plan.policy)[0] is not None
+    sign = float(np.sign(plan.plant.state.scalar(plan.q))) if charted else 0.0
     return StopConditions(squares=squares, sign=[sign])
 
 

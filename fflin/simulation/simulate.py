@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN
 from fflin.base.validation import Array, instance
-from fflin.control.linear_controller import LinearController
+from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
+from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
 from fflin.kernel.compiled import is_kept
@@ -24,11 +26,6 @@ from fflin.simulation.lanes import engine_of, not_compilable, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.control.tvlqr import GainSchedule
 
 # Linear model that predicts a motion, and the command (nu,) for a deviation (nx,) from its point.
 # In the deviation, the robot's states come first, then those of a continuous-time controller.
@@ -234,6 +231,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
         target = state_history(state, q, v, plan.near, run.t)
     energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
+    bound = plan.law and plan.law.policy
     missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
     drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
     return Motion(
@@ -261,7 +259,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         modes=tuple(joint.name for joint in robot.modes),
         mode_rotations=np.array([joint.rotation for joint in robot.modes]),
         steered=plan.steered,
-        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
+        notes=(*growing(plan.policy), *plan.times.notes, *getattr(bound, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
@@ -331,7 +329,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
-            rate = lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0
+            rate = lin.A @ at + lin.B @ (channel.begin(0, at) - u0) + lin.f0
             after = after + weight * dt / 6.0 * rate
         return after
 

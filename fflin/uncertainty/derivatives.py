@@ -4,8 +4,6 @@ M and RNEA are linear in the ten dynamic parameters of each body. So their deriv
 to a dynamic parameter is M or RNEA of a robot in which this parameter is 1 and all others are 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial

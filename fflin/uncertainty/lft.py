@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -28,7 +28,7 @@ from fflin.base.names import matching
 from fflin.base.record import Design
 from fflin.base.rotation import skew
 from fflin.base.tables import counted, cut, folded, grid
-from fflin.base.validation import Array, as_double, numbers
+from fflin.base.validation import Array, Vector, as_double, numbers
 from fflin.linear.linearization import Prepared
 from fflin.linear.model import LinearModel, state_space
 from fflin.robot.mass_properties import Piece
@@ -84,8 +84,6 @@ class LFT(Design):
     (('base.density',), (18, 9))
     """
 
-    VECTORS: ClassVar = ("repeats", "middle", "half")
-
     A: Array
     B1: Array
     B2: Array
@@ -97,9 +95,9 @@ class LFT(Design):
     D22: Array
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    repeats: Array
-    middle: Array
-    half: Array
+    repeats: Vector
+    middle: Vector
+    half: Vector
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]

@@ -1,7 +1,5 @@
 """Robot with uncertain parameters: linear-fractional model, samples and worst case."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations

@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
-from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve
@@ -31,26 +30,19 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
     Wheels and modes are left out.
     """
-    state = StateMap(robot)
-    goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
-    relative = [
-        goal.actInv(pin.XYZQUATToSE3(each[:7])) for goal, each in zip(goals, q, strict=True)
-    ]
-    joints = state.joint_positions(q) - state.joint_positions(target)
-    for index, joint in enumerate(robot.joints):
-        if joint.unbounded:
-            joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
-    wheels = robot.wheels
-    turns = [not (j.prismatic or j.mode or j.name in wheels) for j in robot.joints]
-    slides = [j.prismatic and not j.mode for j in robot.joints]
+    goals = np.broadcast_to(target, q.shape)
+    apart = np.array([pin.difference(robot.model, *each) for each in zip(goals, q, strict=True)])
+    joints = [joint for joint in robot.joints if not (joint.mode or joint.name in robot.wheels)]
+    turning = [joint.idx_v for joint in joints if not joint.prismatic]
+    sliding = [joint.idx_v for joint in joints if joint.prismatic]
     found = {
-        "attitude": ("°", np.degrees([np.linalg.norm(pin.log3(x.rotation)) for x in relative])),
-        "position": ("m", np.array([np.linalg.norm(x.translation) for x in relative])),
+        "attitude": ("°", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
+        "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
-    if any(turns):
-        found["largest joint"] = ("°", np.degrees(np.abs(joints[:, turns]).max(axis=1)))
-    if any(slides):
-        found["largest prismatic joint"] = ("m", np.abs(joints[:, slides]).max(axis=1))
+    if turning:
+        found["largest joint"] = ("°", np.degrees(np.abs(apart[:, turning]).max(axis=1)))
+    if sliding:
+        found["largest prismatic joint"] = ("m", np.abs(apart[:, sliding]).max(axis=1))
     return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 

@@ -7,7 +7,8 @@ import pytest
 
 import fflin
 from fflin.batch.files import FileStore, MemoryStore, read_rows
-from fflin.batch.run import Execution, failure, run_chunks
+from fflin.batch.run import Execution, run_chunks
+from tests.support.messages import any_wording
 
 COUNT, CHUNK = 50, 8
 ALONE = Execution(threads=1)
@@ -39,7 +40,7 @@ def seeds(start, stop):
 def expected():
     store = MemoryStore(COUNT, COUNT, STORED)
     with pytest.warns(fflin.FflinWarning, match="tired"):
-        assert not run_chunks(Walks(), seeds, store, ALONE)
+        run_chunks(Walks(), seeds, store, ALONE)
     return store.arrays
 
 
@@ -58,9 +59,8 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
             closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,
             Execution(workers=workers or None, threads=threads) as how,
         ):
-            failed = run_chunks(job, seeds, store, how, lambda done, _: told.append(done))
-            if failed:
-                raise failure(failed, store, "walks", list)
+            tell = lambda done, _: told.append(done)  # noqa: E731
+            run_chunks(job, seeds, store, how, tell, of_what="walks", made=list)
             store.complete()
 
     with pytest.raises(fflin.SweepError, match=r"1 of 7.*16 to 23.*20"):
@@ -79,14 +79,19 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
 def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
     told, store = [], MemoryStore(COUNT, CHUNK, STORED)
     tell = lambda done, _: told.append(done)  # noqa: E731
-    failed = run_chunks(Walks(endless=20), seeds, store, ALONE, tell, all_needed=True)
-    assert [each[:2] for each in failed] == [(16, 24)] and told == [8, 16]
+    with any_wording(), pytest.raises(fflin.FflinError, match="walk 20 has no end"):
+        run_chunks(Walks(endless=20), seeds, store, ALONE, tell)
+    assert told == [8, 16]
 
 
 def test_in_memory_the_error_has_what_is_made_of_the_rest():
     store = MemoryStore(COUNT, CHUNK, STORED)
-    with pytest.warns(fflin.FflinWarning, match="tired"):
-        failed = run_chunks(Walks(endless=20), seeds, store, ALONE)
-    error = failure(failed, store, "walks", lambda kept: store.arrays["seed"][kept])
+    with (
+        pytest.warns(fflin.FflinWarning, match="tired"),
+        any_wording(),
+        pytest.raises(fflin.SweepError) as caught,
+    ):
+        run_chunks(Walks(endless=20), seeds, store, ALONE, made=lambda rows: rows["seed"])
+    error = caught.value
     assert error.failed == ((16, 24, "walk 20 has no end"),)
     assert np.array_equal(error.batch, np.r_[0:16, 24:50])

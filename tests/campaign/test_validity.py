@@ -111,7 +111,7 @@ def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, ou
     loop = Loop(robots["cubesat"], lin, gain.K)
     x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
     runs_of = partial(settling_runs, loop, False, None, 0.0, "python")
-    found = settle(runs_of, lambda runs: np.tile(x - lin.x0, (len(runs), 1)), 1, Execution())
+    found = settle(runs_of, (x - lin.x0)[None], Execution())
     assert OUTCOMES[int(found["outcome"][0])] == outcome
 
 

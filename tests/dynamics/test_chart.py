@@ -25,7 +25,6 @@ def test_a_base_at_the_reference_has_the_values_of_every_expression(shape):
     for one, other in (
         (standing.q_b, general.q_b),
         (standing.rate(w), general.rate(w)),
-        (standing.rotated(w), general.rotated(w)),
         (standing.rate_over_q_b(w, skew(w)), general.rate_over_q_b(w, skew(w))),
         (standing.over_q_b(slopes), general.over_q_b(slopes)),
         (standing.to_reference(parts, rows), general.to_reference(parts, rows)),

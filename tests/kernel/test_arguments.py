@@ -9,7 +9,6 @@ pytest.importorskip("numba")
 
 import numba
 
-from fflin.kernel.lanes import called
 from fflin.kernel.machine_code import PartLibrary, opener, translated
 from fflin.kernel.tree import (
     FLAG,
@@ -24,6 +23,7 @@ from fflin.kernel.tree import (
     laid_out,
     words_of,
 )
+from fflin.kernel.vectors import called
 
 pytestmark = pytest.mark.compiled
 

@@ -9,8 +9,7 @@ from fflin.campaign.runs import CampaignJob, completed
 
 def flown(job, drawn):
     """The arrays of runs with the drawn values, one chunk after the other."""
-    rows = np.asarray(drawn)
-    return completed(job, lambda start, stop: rows[start:stop], len(rows), Execution(threads=1))
+    return completed(job, np.asarray(drawn), Execution(threads=1))
 
 
 def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
