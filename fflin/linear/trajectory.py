@@ -354,9 +354,7 @@ class Trajectory(Design):
         flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
         digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
-        digits[:3] = _POSITION_ROUNDING * max(
-            float(np.abs(x).max()) for x in (q[:, :3], flown, velocities)
-        )
+        digits[:3] = _POSITION_ROUNDING * np.abs((q[:, :3], flown, velocities)).max()
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
