@@ -3,27 +3,22 @@
 The configurations of a grid, and random configurations, are generated on demand.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base import validation
 from fflin.base.errors import InputError, located
-from fflin.base.validation import Array, frozen
+from fflin.base.validation import Array, ArrayLike, frozen
 from fflin.dynamics.points import configuration
 from fflin.robot.fields import travel_of
 from fflin.robot.joints import ROUND_OFF, Joint, by_joint
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 # Two indices of a joint in q, and a factor. A continuous joint has the indices of (cos, sin); any
 # other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.

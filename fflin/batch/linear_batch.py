@@ -15,7 +15,7 @@ import pinocchio as pin
 from fflin.base import validation
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import reading
-from fflin.base.validation import frozen
+from fflin.base.validation import ArrayLike, frozen
 from fflin.base.writing import as_path
 from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
@@ -24,8 +24,6 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.base.validation import Array, Indices, Mask
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot

@@ -21,7 +21,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, Indices, frozen, vector
+from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
 from fflin.batch.configurations import (
     Configurations,
     Grid,
@@ -43,8 +43,6 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
@@ -216,16 +214,14 @@ class ChunkJob:
         self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
-        measured = prepared.sensing is not None
-        if checked_engine(engine) == "compiled" and measured:
+        reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
+        if reason and engine == "compiled":
             raise InputError(
-                "engine='compiled' is not possible, because the outputs are not the state; "
-                "leave engine out"
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
             )
-        in_python = engine == "python" or measured or prepared.not_compilable
         # Compiled accelerations for many points at once; None if Python computes the points.
         self._kernel: RowAccelerations | None = None
-        if engine == "compiled" or not in_python:
+        if engine != "python" and not reason:
             self._kernel = prepared.kernel()
         self.threaded = self._kernel is not None
         self._data = robot.create_data()

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +16,7 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.intervals import until_failure
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, Vector
+from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import CampaignJob, completed
@@ -29,9 +28,6 @@ from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
