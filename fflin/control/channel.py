@@ -60,9 +60,7 @@ def saturation(
     at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
     least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
-    # An on-off thruster without a finite limit uses its own `max`.
-    own = [item.ranges[0][1] if item.on_off else np.inf for _, item in thrusters.values()]
-    most = np.where(np.isfinite(high[at]), high[at], own)
+    most = high[at]
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         why = (

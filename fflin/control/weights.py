@@ -129,14 +129,6 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     return matrix
 
 
-def columns(what: str, value: ArrayLike, rows: int) -> Array:
-    """Return a checked matrix (rows, k) with k >= 1."""
-    shape = np.shape(value) if dimension(what, value) == 2 else ()
-    if not shape or not shape[1]:
-        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
-    return shaped(what, value, (rows, shape[1]))
-
-
 def require_semidefinite(
     what: str, matrix: Array, names: Sequence[str], rounding: float, definite: bool = False
 ) -> None:
