@@ -191,7 +191,6 @@ class AllocatedPolicy:
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
         self.advance = self._command.advance
-        self._inner = inner
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 
@@ -204,7 +203,7 @@ class AllocatedPolicy:
         )
         said = f"allocation: the commanded {', '.join(asked)} are realised by {', '.join(given)}"
         same = self._design.names == self._robot.names
-        return (*[said] * (not same), *getattr(self._inner, "notes", ()))
+        return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner policy."""
