@@ -5,8 +5,6 @@
 is less sensitive to rounding.
 """
 
-from __future__ import annotations
-
 from operator import itemgetter
 
 import numpy as np

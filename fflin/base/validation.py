@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import pinocchio as pin
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 else:
     # Importing numpy.typing would take a tenth of the start time of the command line.
+    ArrayLike = object
     Array = Complex = Values = Vector = Poles = Open = Mask = Indices = np.ndarray
 
 T = TypeVar("T")

@@ -1,7 +1,5 @@
 """Mass properties of a robot at an operating point, and authority of its wheels and thrusters."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations, islice
 from typing import NamedTuple

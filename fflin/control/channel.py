@@ -1,7 +1,5 @@
 """Channel from command to actuator: sample and hold, delay, limits, wheels and thruster pulses."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping

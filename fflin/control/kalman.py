@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
@@ -14,12 +13,12 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Poles, Vector, dimension, instance, number, shaped
+from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
-from fflin.control.tvlqr import FilterSchedule, asks_steady, require_continuous, steady_end
+from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time, steady_end
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
@@ -381,8 +380,7 @@ def tvkalman(
     >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
     (21, 18, 18)
     """
-    require_continuous(traj)
-    dt = number("sample", sample)
+    dt = sample_time(traj, sample)
     V = weight("V", V, traj.output_names, definite=True)
     noise, columns = disturbance(traj, W, G)
     columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))

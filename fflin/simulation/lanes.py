@@ -3,8 +3,6 @@
 Each run has a lane. If there is only one run, all lanes compute it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 

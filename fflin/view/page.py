@@ -3,8 +3,6 @@
 Wheels and thrusters are drawn at their places on the links.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import math

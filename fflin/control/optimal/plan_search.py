@@ -1,7 +1,5 @@
 """Search for a plan by sequential quadratic programming with multiple shooting."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

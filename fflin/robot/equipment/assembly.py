@@ -93,8 +93,6 @@ def equipped(
                 )
             taken.add(part.name)
         model = with_mounted(model, bodies, parts)
-        for part in parts:
-            model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(each.within(model) for each in followers)
