@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
@@ -14,7 +13,7 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Poles, Vector, dimension, instance, number
+from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, number
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati

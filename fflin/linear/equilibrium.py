@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid
-from fflin.base.validation import Array, Complex, FrozenArrays, Mask, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, Indices, Mask, instance
 from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
 from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.dynamics.state import Actuation, Frame, StateMap
@@ -225,10 +225,9 @@ class _Balance:
         rounding[6:] += springs.stiffness * farthest
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
         wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
-        one_sided = np.zeros(len(actuation.names), dtype=bool)
-        one_sided[actuation.groups.get("thrust", [])] = True
+        thrusts: Indices | list[int] = actuation.groups.get("thrust", [])
         target = mobility * wanted
-        self.u, self.left = least_norm(mobility[:, None] * columns, target, one_sided)
+        self.u, self.left = least_norm(mobility[:, None] * columns, target, thrusts)
         self.allowed = TOLERANCE * float(np.linalg.norm(target))
         self.allowed += float(np.linalg.norm(mobility * rounding))
         self.residual, self.tolerance = self.left / mobility, rounding + terms
@@ -281,21 +280,21 @@ _EPS = float(np.finfo(float).eps)
 TOLERANCE = 1e-9
 
 
-def least_norm(C: Array, d: Array, one_sided: Mask) -> tuple[Array, Array]:
+def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Array, Array]:
     """Return the minimum-norm u with ``C u = d`` and ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest
 
-        least, most = np.where(one_sided, 0.0, -np.inf), np.full(len(u), np.inf)
-        u = nearest(C, d, least, most)
+        least, most = np.full((2, len(u)), [[-np.inf], [np.inf]])
+        least[one_sided] = 0.0
+        bounded = nearest(C, d, least, most)
         # Solve again for the nonzero inputs alone, without bounds. This removes the rounding
         # errors of the bounded solution.
-        pushing = ~one_sided | (u > TOLERANCE * float(np.abs(u).max(initial=0.0)))
-        polished: Array = np.zeros(len(u))
-        polished[pushing] = _pseudo_solve(C[:, pushing], d)
-        if (polished[one_sided] >= 0.0).all():
-            u = polished
+        pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
+        u = np.zeros(len(u))
+        u[pushing] = _pseudo_solve(C[:, pushing], d)
+        u = bounded if (u[one_sided] < 0.0).any() else u
     return u, C @ u - d
 
 

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dposv
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, as_double, vector
+from fflin.base.validation import Array, ArrayLike, as_double, vector
 from fflin.control.policies import feedback_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.points import LARGEST_SPEED
