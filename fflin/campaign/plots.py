@@ -1,14 +1,12 @@
 """Figures of campaigns, of the validity of a linear model, and of funnels."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from fflin.base.figures import COLORS, drawing
+from fflin.base.figures import COLORS, Axes, Figure, drawing
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
@@ -16,10 +14,6 @@ from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
 from fflin.campaign.statistics import KINDS
 from fflin.campaign.validity import TRUSTED, Validity, shown
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # For each band: fraction of runs outside it on each side, name and opacity; widest band first.
 _BANDS = (

@@ -1,7 +1,5 @@
 """Computation of runs in chunks: eight at a time in compiled code, or one by one in Python."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence

@@ -3,8 +3,6 @@
 Their size does not depend on the duration of the run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias

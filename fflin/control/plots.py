@@ -1,27 +1,21 @@
 """Figures of linear models and control loops: matrices, modes, checks, poles and margins."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.analysis.modes import Modes
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
+from fflin.base.figures import COLORS, Axes, Figure, cycle, drawing, letters_of, logarithmic
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import Array, Mask, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _LINE = "#888888"
 

@@ -134,6 +134,8 @@ class Prepared:
         from fflin.kernel.tree import batch_tree
 
         name = self.robot.name
+        if self.sensing is not None:
+            return "the outputs are not the state"
         if not numba_is_there():
             return "numba is not installed (pip install 'fflin[fast]')"
         if self.robot.orbit:
@@ -141,14 +143,10 @@ class Prepared:
         return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; raise `InputError` if they are not available."""
+        """Return the compiled accelerations, unless the robot is `not_compilable`."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
-        if reason := self.not_compilable:
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
         tree = batch_tree(self.robot)
         assert tree is not None
         return RowAccelerations(self.map, self.actuation, tree)

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Result, Vector, frozen, number, positive
+from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
     import control
     import pinocchio as pin
-    from numpy.typing import ArrayLike
     from scipy import signal
 
     from fflin import ToolModel

@@ -3,8 +3,6 @@
 Equation numbers refer to docs/derivation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

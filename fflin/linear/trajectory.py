@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import as_double, frozen, instance, number, vector
+from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
@@ -355,9 +354,7 @@ class Trajectory(Design):
         flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
         digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
-        digits[:3] = _POSITION_ROUNDING * max(
-            float(np.abs(x).max()) for x in (q[:, :3], flown, velocities)
-        )
+        digits[:3] = _POSITION_ROUNDING * np.abs((q[:, :3], flown, velocities)).max()
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.optimal.plan_search import StageQP
+from fflin.control.optimal import plan_search
 from fflin.control.optimal.shooting import Shooting
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
@@ -236,8 +236,8 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
 @pytest.mark.parametrize("duration", [3.0, 5.0])
 def test_an_infeasible_plan_gives_up_and_names_the_limit(one_joint, monkeypatch, duration):
     """A joint needs 1 rad / (0.13 rad/s) = 7.7 s; the search stops after ten iterations in vain."""
-    solved, solve = [], StageQP.solve
-    monkeypatch.setattr(StageQP, "solve", lambda qp: solved.append(len(qp.rows.k)) or solve(qp))
+    solved, solve = [], plan_search.solve_stages
+    monkeypatch.setattr(plan_search, "solve_stages", lambda *qp: solved.append(1) or solve(*qp))
     robot, goal = one_joint
     with any_wording(), pytest.raises(fflin.InputError, match=r"joint_1.*longer duration"):
         fflin.plan(robot, (goal, None), duration, knots=21, limits=SPEEDS)
@@ -337,8 +337,9 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D, inside = shooting.jacobians(q, v, u, 4)
-    h, nx = 1e-5, A.shape[1]
+    ends_by, inside = shooting.jacobians(q, v, u, 4)
+    h, (_, nx, _) = 1e-5, ends_by.shape
+    A, B, D = np.split(ends_by, (nx, nx + u.shape[1]), axis=2)
 
     def ends(z, du):
         knots = shooting.moved(q, v, z)
@@ -400,8 +401,9 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    A, B, *_ = shooting.jacobians(motion.q, motion.v, motion.u)
-    size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
+    nx = shooting.state.nx
+    A, B, _ = np.split(shooting.jacobians(motion.q, motion.v, motion.u)[0], (nx, nx + 6), axis=2)
+    size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(nx), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)
         reach = reach @ A[k]
