@@ -14,7 +14,7 @@ from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
 from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import TRUSTED, Validity, shown
 
 if TYPE_CHECKING:
