@@ -186,7 +186,21 @@ class ModelDerivatives:
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            F, F_q, F_nu, F_turn = self._forces()
+            # F_p and its derivatives over q_m, nu and base rotations, of bodies one at a time.
+            lone = self.robot.model.copy()
+            lone.armature = np.zeros_like(lone.armature)
+            for joint in range(lone.njoints):
+                lone.inertias[joint] = pin.Inertia.Zero()
+            forces: tuple[list[Array], ...] = ([], [], [], [])
+            for joint in self._joints:
+                of_bodies = []
+                for body in _BODIES:
+                    lone.inertias[joint] = body
+                    of_bodies.append(self._rnea_derivatives(lone))
+                lone.inertias[joint] = pin.Inertia.Zero()
+                for kept, values in zip(forces, zip(*of_bodies, strict=True), strict=True):
+                    kept.append(np.tensordot(_OF_BODIES, values, 1))
+            F, F_q, F_nu, F_turn = map(np.array, forces)
             found.c[:] = -F @ self._inverse
             for body, at in np.ndindex(count):
                 F_q[body, at] += self._by_acceleration(found.c[body, at])
@@ -214,23 +228,6 @@ class ModelDerivatives:
         J = self._jacobians()
         forces = UNITS @ (J @ given)[:, None]
         return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
-
-    def _forces(self) -> tuple[Array, ...]:
-        """Return F_p (bodies, 10, 6 + n) and its derivatives over q_m, nu and base rotations."""
-        lone = self.robot.model.copy()
-        lone.armature = np.zeros_like(lone.armature)
-        for joint in range(lone.njoints):
-            lone.inertias[joint] = pin.Inertia.Zero()
-        found: tuple[list[Array], ...] = ([], [], [], [])
-        for joint in self._joints:
-            of_bodies = []
-            for body in _BODIES:
-                lone.inertias[joint] = body
-                of_bodies.append(self._rnea_derivatives(lone))
-            lone.inertias[joint] = pin.Inertia.Zero()
-            for kept, values in zip(found, zip(*of_bodies, strict=True), strict=True):
-                kept.append(np.tensordot(_OF_BODIES, values, 1))
-        return tuple(np.array(each) for each in found)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
         """Return the forces of RNEA and their derivatives over q_m, nu and base rotations.
