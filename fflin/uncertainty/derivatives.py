@@ -103,7 +103,7 @@ class ModelDerivatives:
                     part[row] = of_force
         seen = self._seen(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
-        f0 = assemble(state, ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
