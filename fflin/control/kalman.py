@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
@@ -14,7 +12,7 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Poles, Vector, dimension, instance, number
+from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, number
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
@@ -23,10 +21,7 @@ from fflin.control.tvlqr import FilterSchedule, asks_steady, require_continuous,
 from fflin.control.weights import Weight, columns, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
-from fflin.linear.model import LinearModel, state_space
-
-if TYPE_CHECKING:
-    import control
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,7 +87,7 @@ class Estimator(ModelDesign):
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
         Raises
@@ -142,7 +137,7 @@ class Compensator(ModelDesign):
     u0: Vector
     output_names: tuple[str, ...]
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
         Raises

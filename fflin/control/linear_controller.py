@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, Mask, as_double, instance, number
+from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of

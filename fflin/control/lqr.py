@@ -1,12 +1,9 @@
 """Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.analysis.controllability import require_stabilizable, require_weighed
 from fflin.analysis.reduction import regulated_part, selection
@@ -17,7 +14,7 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, ArrayLike, dimension, instance
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
 from fflin.control.weights import Weight, cost_weights, rule_weights, weight

@@ -9,12 +9,11 @@ from itertools import compress
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Indices, Mask, instance, number, vector, whole
+from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, number, vector, whole
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back

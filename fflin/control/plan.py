@@ -1,7 +1,5 @@
 """Trajectory planning: low-effort motions between two states within limits."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -9,12 +7,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, Mask, number, whole
+from fflin.base.validation import Array, ArrayLike, Mask, number, whole
 from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight

@@ -7,11 +7,10 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider

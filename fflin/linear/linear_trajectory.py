@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array
+from fflin.base.validation import Array, ArrayLike
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.fit import require_same
 from fflin.linear.linearization import Linearizer

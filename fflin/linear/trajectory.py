@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import as_double, frozen, instance, number, vector
+from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit

@@ -9,11 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
