@@ -315,7 +315,7 @@ class ChunkJob:
         A[:, :nv] = ready.rest["A"][:nv]
         c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
-        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
