@@ -21,10 +21,9 @@ from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import require_same
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 if TYPE_CHECKING:
-    import control
     import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
@@ -171,7 +170,7 @@ class Gain(ModelDesign):
         """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
 
         Raises

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -22,10 +21,7 @@ from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time, steady
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
-from fflin.linear.model import LinearModel, state_space
-
-if TYPE_CHECKING:
-    import control
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,7 +87,7 @@ class Estimator(ModelDesign):
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
         Raises
@@ -141,7 +137,7 @@ class Compensator(ModelDesign):
     u0: Vector
     output_names: tuple[str, ...]
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
         Raises

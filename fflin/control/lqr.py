@@ -1,7 +1,5 @@
 """Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Trajectory planning: low-effort motions between two states within limits."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing

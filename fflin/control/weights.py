@@ -23,7 +23,7 @@ from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
-Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
+Weight: TypeAlias = ArrayLike | Mapping[str, float]
 
 # A weight from the user, its name or pattern, and whether it is a largest value (Bryson).
 _Given: TypeAlias = tuple[float, str, bool]

@@ -48,7 +48,7 @@ _LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
 
-class Plant:
+class Plant(Aba):
     """The nonlinear robot under inputs (in the axes of the state's frame) and a disturbance."""
 
     def __init__(
@@ -57,13 +57,10 @@ class Plant:
         disturbance: Disturbance | None = None,
         faults: ActuatorFaults | None = None,
     ) -> None:
-        robot = state.robot
+        self.robot = robot = state.robot
         require_inertia(robot)
-        self.state, self.robot = state, robot
-        self._aba = Aba(state)
-        self.actuation = self._aba.actuation
+        super().__init__(state)
         self.disturbance = disturbance
-        self._model, self._data = robot.model, robot.create_data()
         nu, groups = len(self.actuation.names), self.actuation.groups
         # Index of the first of the three inputs of each vector on the base.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
@@ -78,7 +75,6 @@ class Plant:
         # Whether only u acts on the robot, with a constant input matrix.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
-        self.field = self._aba.field
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
@@ -105,7 +101,7 @@ class Plant:
             if np.abs(v).max() < _DIVERGED:
                 expected = "a generalised force (nv,) in Pinocchio's order"
                 disturbed = vector(name, disturbed, self.robot.nv, expected)
-        rate = self._aba.acceleration(q, v, u, disturbed)
+        rate = self.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
         if self.field:
             nu = self.state.velocities(v)
