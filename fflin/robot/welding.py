@@ -1,6 +1,5 @@
 """Welding of joints at given values, and of one robot to a frame of another."""
 
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
@@ -104,19 +103,15 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
     for index in indices:
         if not model.existFrame(model.names[index], pin.FrameType.JOINT):
             model.addJointFrame(index)
-    # Pinocchio finds frames by name, and a link and a joint may share a name. So frames of links
-    # are renamed temporarily.
-    names = Counter(frame.name for frame in model.frames.tolist())
-    shared: dict[str, str] = {}
+    # Pinocchio finds frames by name, and a link and a joint may share a name. So all frames except
+    # those of joints have numbers for names until the joints are welded.
+    names = {}
     for index, frame in enumerate(model.frames):
-        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
-            alias = f"{index}/{frame.name}"
-            while alias in names:
-                alias += "/"
-            shared[alias], frame.name = frame.name, alias
+        if index and frame.type != pin.FrameType.JOINT:
+            names[f"\0{index}"], frame.name = frame.name, f"\0{index}"
     reduced = pin.buildReducedModel(model, indices, q)
     for frame in reduced.frames:
-        frame.name = shared.get(frame.name, frame.name)
+        frame.name = names.get(frame.name, frame.name)
     return reduced
 
 
