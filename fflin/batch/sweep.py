@@ -278,8 +278,17 @@ class ChunkJob:
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code; return the rows for which it is not accurate or possible."""
         kernel, q = self._kernel, rows["q"]
-        if kernel is None or len(q) < LANES:  # too few rows for the kernel
-            return np.arange(len(q))
+        count = len(q)
+        if kernel is None:
+            return np.arange(count)
+        if count < LANES:  # fill up the lanes by repeating the last row
+            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
+            for key, array in out.items():
+                more[key] = np.empty((LANES, *array.shape[1:]))
+            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
         with np.errstate(all="ignore"):
             if self.only_inertia:
                 good = kernel.write_inverse(q, out["B_lower"])
@@ -306,7 +315,7 @@ class ChunkJob:
         A[:, :nv] = ready.rest["A"][:nv]
         c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
-        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:

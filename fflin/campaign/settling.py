@@ -16,8 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, Judge
+from fflin.campaign.runs import EDGE, CampaignJob, Judge, completed
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit

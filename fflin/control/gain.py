@@ -21,10 +21,9 @@ from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import require_same
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 if TYPE_CHECKING:
-    import control
     import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
@@ -171,7 +170,7 @@ class Gain(ModelDesign):
         """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
 
         Raises
@@ -300,7 +299,7 @@ def _poles(gain: Gain) -> str:
     """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
-    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping"]
+    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
     rows = Counter(
         (
             f"{poles[k].real:.5g}" + (f" +- {poles[k].imag:.5g}i" if poles[k].imag else ""),
@@ -309,11 +308,10 @@ def _poles(gain: Gain) -> str:
         )
         for k in np.argsort(-rates.real)
     )
-    body = [list(row) for row in rows]
-    if max(rows.values()) > 1:
-        heads.append("times")
-        body = [[*row, f"{count}"] for row, count in rows.items()]
-    return f"poles of A - B K, slowest first\n\n{grid(cut([heads, *body]), 'l')}"
+    table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
+    if max(rows.values()) == 1:
+        table = [row[:-1] for row in table]
+    return f"poles of A - B K, slowest first\n\n{grid(cut(table), 'l')}"
 
 
 class Margins(NamedTuple):

@@ -378,7 +378,7 @@ class Actuation:
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
-        self._state, self._model = state, robot.model
+        self.state, self._model = state, robot.model
         names: list[str] = []
         units: list[str] = []
         groups: list[str] = []
@@ -447,7 +447,7 @@ class Actuation:
             pin.getJointJacobian(self._model, data, joint, pin.ReferenceFrame.LOCAL).T.dot(wrenches)
             for joint, _, wrenches in self.wrench_columns
         ]
-        columns[:, self._of_carried] = self._state.forces(np.concatenate(forces, axis=1))
+        columns[:, self._of_carried] = self.state.forces(np.concatenate(forces, axis=1))
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:

@@ -391,19 +391,17 @@ class Trajectory(Design):
                 found.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
         return np.where(np.isfinite(found), found, np.inf)
 
-    def end(
-        self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
-    ) -> tuple[Array, Array]:
-        """Integrate by CF4 (11.1) over part of an interval, by default all of it; return q, v."""
+    def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
+        """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
         start, h = self.t[k], self.t[k + 1] - self.t[k]
-        method = CommutatorFree4(self.robot.model, (over[1] - over[0]) * h / steps)
+        method = CommutatorFree4(self.robot.model, h / steps)
 
         def rate(t: float, q: Array, v: Array) -> Array:
             u = self._in_base_axes(q, self._input(k, (t - start) / h))
             return self._aba.acceleration(q, v, u).copy()
 
         for step in range(steps):
-            q, v = method.step(rate, start + over[0] * h + step * method.dt, q, v)
+            q, v = method.step(rate, start + step * method.dt, q, v)
         return q, v
 
     @cached_property

@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
-from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
+from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
@@ -275,11 +275,15 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            terms, model = policy.terms, lin
-            law = Compensation(len(terms.A), lambda _: terms)
-            return model, lambda e: law.step(
-                0.0, lambda _, u: model.y0 + model.C @ e + model.D @ (u - model.u0)
-            )
+            by, model = policy.terms, lin
+            z: Array = np.zeros(len(by.A))
+
+            def command(e: Array) -> Array:
+                nonlocal z
+                u, z = by.step(z, lambda u: model.y0 + model.C @ e + model.D @ (u - model.u0))
+                return u
+
+            return lin, command
         offset: Array = np.zeros(len(lin.u0))
         gains: Array = np.zeros(lin.B.T.shape)
         # An allocation has no K of its own, because it is nonlinear.

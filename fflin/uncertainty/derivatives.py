@@ -103,7 +103,7 @@ class ModelDerivatives:
                     part[row] = of_force
         seen = self._seen(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
-        f0 = assemble(state, ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
@@ -186,7 +186,21 @@ class ModelDerivatives:
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            F, F_q, F_nu, F_turn = self._forces()
+            # F_p and its derivatives over q_m, nu and base rotations, of bodies one at a time.
+            lone = self.robot.model.copy()
+            lone.armature = np.zeros_like(lone.armature)
+            for joint in range(lone.njoints):
+                lone.inertias[joint] = pin.Inertia.Zero()
+            forces: tuple[list[Array], ...] = ([], [], [], [])
+            for joint in self._joints:
+                of_bodies = []
+                for body in _BODIES:
+                    lone.inertias[joint] = body
+                    of_bodies.append(self._rnea_derivatives(lone))
+                lone.inertias[joint] = pin.Inertia.Zero()
+                for kept, values in zip(forces, zip(*of_bodies, strict=True), strict=True):
+                    kept.append(np.tensordot(_OF_BODIES, values, 1))
+            F, F_q, F_nu, F_turn = map(np.array, forces)
             found.c[:] = -F @ self._inverse
             for body, at in np.ndindex(count):
                 F_q[body, at] += self._by_acceleration(found.c[body, at])
@@ -214,23 +228,6 @@ class ModelDerivatives:
         J = self._jacobians()
         forces = UNITS @ (J @ given)[:, None]
         return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
-
-    def _forces(self) -> tuple[Array, ...]:
-        """Return F_p (bodies, 10, 6 + n) and its derivatives over q_m, nu and base rotations."""
-        lone = self.robot.model.copy()
-        lone.armature = np.zeros_like(lone.armature)
-        for joint in range(lone.njoints):
-            lone.inertias[joint] = pin.Inertia.Zero()
-        found: tuple[list[Array], ...] = ([], [], [], [])
-        for joint in self._joints:
-            of_bodies = []
-            for body in _BODIES:
-                lone.inertias[joint] = body
-                of_bodies.append(self._rnea_derivatives(lone))
-            lone.inertias[joint] = pin.Inertia.Zero()
-            for kept, values in zip(found, zip(*of_bodies, strict=True), strict=True):
-                kept.append(np.tensordot(_OF_BODIES, values, 1))
-        return tuple(np.array(each) for each in found)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
         """Return the forces of RNEA and their derivatives over q_m, nu and base rotations.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -30,13 +30,10 @@ from fflin.base.rotation import skew
 from fflin.base.tables import counted, cut, folded, grid
 from fflin.base.validation import Array, Vector, as_double, numbers
 from fflin.linear.linearization import Prepared
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 from fflin.robot.mass_properties import Piece
 from fflin.uncertainty.derivatives import UNITS
 from fflin.uncertainty.parameters import AXES, ENTRIES, OF_PIECES, Parameter
-
-if TYPE_CHECKING:
-    import control
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -177,7 +174,7 @@ class LFT(Design):
             self.D22 + self.D21 @ by[..., nx:],
         )
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.
 
         The channels of w and z have names such as ``w_PARAMETER_1`` and ``z_PARAMETER_1``. Dots in

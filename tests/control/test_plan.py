@@ -11,7 +11,7 @@ from fflin.control.optimal import plan_search
 from fflin.control.optimal.shooting import Shooting
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
-from tests.support.speeds import largest_speeds
+from tests.support.speeds import between_knots, largest_speeds
 
 
 def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
@@ -176,12 +176,7 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     # The same again, to the last bit.
     again = fflin.plan(robot, (goal, None), 10.0, v0=v0, **options)
     assert (again.u == motion.u).all() and (again.q == motion.q).all()
-    parts, largest = 64, 0.0
-    for k in range(knots - 1):
-        q, v = motion.q[k], motion.v[k]
-        for part in range(parts):
-            q, v = motion.end(k, 1, q, v, (part / parts, (part + 1) / parts))
-            largest = max(largest, abs(v[6]))
+    largest = largest_speeds(motion)[0]
     assert 0.97 * limit < largest <= 1.01 * limit
     assert missed(robot, motion, goal) < 1e-6
     said = " ".join(str(motion).split())
@@ -200,11 +195,8 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     found = re.search(
         r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split())
     )
-    fine = [
-        motion.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
-        for k in range(5)
-        for part in range(1, 17)
-    ]
+    ends = [[v[6] for _, v in between_knots(motion, k, 128)] for k in range(5)]
+    fine = np.ravel(ends)[7::8]
     assert found and float(found[1]) > 3.0
     assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
