@@ -88,9 +88,7 @@ def inwards(work, tree):
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA
         place = places + body * PLACE
-        z = vec.get3(work, place + 6)
-        axis = vec.times(z, tree.turns[body]), vec.times(z, tree.slides[body])
-        moment, force = spatial_inertia_times(work, at, axis)
+        wrench = spatial_inertia_times(work, at, joint_axis(work, tree, body))
         # Add the composite inertia, expressed at the parent's joint, to the parent's inertia.
         m, h, d = load(work, at), vec.get3(work, at + 1), vec.get3(work, place + 9)
         (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
@@ -105,17 +103,12 @@ def inwards(work, tree):
         vec.add6(work, to + 4, ((xx + (py + pz), xy, xz), (yy + (px + pz), yz, zz + (px + py))))
         above = body
         while above > 0:
-            place = places + above * PLACE
-            z = vec.get3(work, place + 6)
-            value = tree.turns[above] * vec.dot(z, moment)
-            value = value + tree.slides[above] * vec.dot(z, force)
-            vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
+            value = tree.share[pair] * vec.dot6(joint_axis(work, tree, above), wrench)
+            vec.add(work, packed + tree.target[pair], value)
             pair += 1
-            # Move the moment to the parent's joint.
-            moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
+            wrench = at_parent(work, places + above * PLACE, wrench)
             above = tree.parent[above]
-        row = vec.times6((moment, force), tree.share[pair])
-        vec.add6(work, packed + tree.target[pair], row)
+        vec.add6(work, packed + tree.target[pair], wrench)
         pair += 1
     # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
     m = load(work, inertias)
