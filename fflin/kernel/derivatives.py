@@ -261,4 +261,7 @@ class RowAccelerations:
         )
         # A zero pivot gives NaN, and comparisons with NaN are false.
         good = (self._least_coupling < judged) & (judged < WARNING_COUPLING)
-        return good[:, 0] & (np.abs(points[0][:, 7:]) < _FARTHEST).all(axis=1)
+        q_m = points[0][:, 7:]
+        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
+            return good[:, 0]
+        return good[:, 0] & (np.abs(q_m) < _FARTHEST).all(axis=1)

@@ -242,10 +242,11 @@ def _tree(robot: Robot) -> Tree | None:
         while above > 0:
             low, high = sorted((coordinate[body], coordinate[above]))
             target.append(row[high] + paths[high].index(low))
-            share.append(2.0 if low == high and above != body else 1.0)
+            twice = 2.0 if low == high and above != body else 1.0
+            share.append(twice * factor[body] * factor[above])
             above = parent[above]
         target.append(row[coordinate[body]])
-        share.append(1.0)
+        share.append(factor[body])
     # For each two coordinates, the number of coordinates that their paths have in common.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
