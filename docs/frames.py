@@ -14,7 +14,7 @@ import numpy as np
 
 import fflin
 from fflin.batch.run import Execution
-from fflin.campaign.settling import OUTCOMES, checked_loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -29,11 +29,11 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
     counts = dict.fromkeys(FRAMES, 0)
     for k, q in enumerate(fflin.random_configurations(robot, POSTURES).rows(0, POSTURES)):
         lin = fflin.linearize(robot, q)
-        loop = checked_loop(robot, lin, GAINS[design](lin))
+        loop = Loop(robot, lin, GAINS[design](lin))
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
         x = (x - loop.start)[None]
         for frame in FRAMES:
-            there = replace(loop, lin=replace(lin, frame=frame))
+            there = Loop(robot, replace(lin, frame=frame), loop.K)
             runs_of = partial(settling_runs, there, False, None, 0.0, "python")
             arrays = settle(runs_of, x, Execution())
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"

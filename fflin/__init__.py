@@ -41,8 +41,7 @@ _PUBLIC = {
         "analysis.observability": "observability Observability gramians Gramians",
         "analysis.modes": "modes Modes Mode",
         "analysis.effective_masses": "effective_masses EffectiveMasses",
-        "analysis.relative_equilibria": "relative_equilibria RelativeEquilibria "
-        "RelativeEquilibrium",
+        "linear.equilibrium": "relative_equilibria RelativeEquilibria RelativeEquilibrium",
         "analysis.reduction": "momentum_reduction ReducedModel generalized_inertia "
         "generalized_jacobian",
     },

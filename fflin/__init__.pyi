@@ -70,9 +70,9 @@ from fflin.analysis.modes import Modes as Modes
 from fflin.analysis.modes import Mode as Mode
 from fflin.analysis.effective_masses import effective_masses as effective_masses
 from fflin.analysis.effective_masses import EffectiveMasses as EffectiveMasses
-from fflin.analysis.relative_equilibria import relative_equilibria as relative_equilibria
-from fflin.analysis.relative_equilibria import RelativeEquilibria as RelativeEquilibria
-from fflin.analysis.relative_equilibria import RelativeEquilibrium as RelativeEquilibrium
+from fflin.linear.equilibrium import relative_equilibria as relative_equilibria
+from fflin.linear.equilibrium import RelativeEquilibria as RelativeEquilibria
+from fflin.linear.equilibrium import RelativeEquilibrium as RelativeEquilibrium
 from fflin.analysis.reduction import momentum_reduction as momentum_reduction
 from fflin.analysis.reduction import ReducedModel as ReducedModel
 from fflin.analysis.reduction import generalized_inertia as generalized_inertia

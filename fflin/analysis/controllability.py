@@ -311,7 +311,7 @@ def require_stabilizable(lin: LinearModel) -> None:
         if count:
             words += (
                 ", add a spring to any joint that no input moves (--stiffness, stiffness=), or "
-                "design on fflin.momentum_reduction(lin)"
+                "design on fflin.momentum_reduction(lin) (--reduce)"
             )
     return _conclude(StabilizabilityError, words, found.notes, found.margin)
 

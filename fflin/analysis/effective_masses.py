@@ -1,7 +1,5 @@
 """Effective masses of the vibration modes of a robot whose base is fixed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

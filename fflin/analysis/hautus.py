@@ -5,8 +5,6 @@
 is less sensitive to rounding.
 """
 
-from __future__ import annotations
-
 from operator import itemgetter
 
 import numpy as np
@@ -102,11 +100,12 @@ def split_by_poles(
         poles = 1.0 + dt * rates / unit if dt else rates / unit
         decay = 1.0 - np.abs(poles) if dt else -rates.real
         least, most = int(decay.argmin()), int(decay.argmax())
-        slow = ranks.decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
+        slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
         if dt and abs(poles[most]) < _DEAD:
             # Two motions cannot be distinguished if both decay to rounding error within one sample.
-            margin &= ranks.decided(1.0, shapes[:, most]).transformed(1.0, halved=True)
-        settling = slow.transformed(1.0, halved=True)
+            dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
+            margin &= dead.transformed(1.0, halved=True)
+        settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
         fixed = ranks.FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
     return to_x @ inside, to_x @ rest, rest.T @ from_x, fixed
 
@@ -183,7 +182,7 @@ def unobservable(
     margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
     at_zero = basis * scale[:, None]
     motions, poles = [at_zero], [0j] * at_zero.shape[1]
-    slowest = ranks.Decision(np.inf)
+    decays: list[ranks.Decision] = []
     missed: list[tuple[complex, Values]] = []
     for start in starts:
         shapes, pole, certain = _missed_shapes_at(system, position, velocity, complex(start))
@@ -205,17 +204,18 @@ def unobservable(
         motions += [motion.real, motion.imag][: len(pair)]
         poles += [each for each in pair for _ in shapes.T]
         decay = max(-pole.real / abs(pole) / (1e2 * ranks.EPS * len(system.M)), 0.0)
-        slowest = min(slowest, ranks.Decision(decay, shapes[:, 0]), key=itemgetter(0))
+        decays.append(ranks.Decision(decay, shapes[:, 0]))
     known = [pole for pole, _ in missed]
     near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
     if any(near):
         return None
+    slowest = [] if at_zero.shape[1] else sorted(decays, key=itemgetter(0))[:1]
     fixed = ranks.FixedPoles(
         poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
-        decays=not at_zero.shape[1] and slowest.ratio > 1.0,
+        decays=not at_zero.shape[1] and all(one.ratio > 1.0 for one in slowest),
         margin=margin,
-        settling=ranks.Margin() if at_zero.shape[1] else ranks.decided(slowest.ratio, slowest.at),
+        settling=ranks.Margin(tuple(slowest)),
     )
     return np.hstack(motions), tuple(missed), fixed
 

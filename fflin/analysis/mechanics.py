@@ -264,10 +264,9 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
     )
     # The inputs cannot move the named coordinate while the others are fixed, but they may move it
     # together with the others.
-    only_joints = all(rates[i][0] == "qdot_m" for i in conserved.kept)
-    of_base = all(
-        not row[i] for row in conserved.weights for i in range(nv) if rates[i][0] == "qdot_m"
-    )
+    of_joint = np.array([group == "qdot_m" for group, _ in rates])
+    only_joints = of_joint[conserved.kept].all()
+    of_base = not conserved.weights[:, of_joint].any()
     rest = "the joints" if only_joints and of_base else "the rest"
     return (
         *(combination(row, momenta, size) for row in conserved.weights),

@@ -1,7 +1,5 @@
 """Natural modes of a linear model: free-free frequencies, damping ratios, shapes."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping
 from contextlib import suppress

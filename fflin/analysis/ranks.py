@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -28,58 +27,45 @@ class Decision(NamedTuple):
     """Singular value divided by its tolerance; it counts as nonzero if this ratio is above 1."""
 
     ratio: float
-    at: Values = np.zeros(0)  # singular vector; empty without a decision
+    at: Values  # singular vector
     states: int = 1  # states concerned: 2 for a pair of poles, or a momentum and its coordinate
 
 
 class Margin(NamedTuple):
     """Margin of rank decisions: smallest value counted as nonzero, largest counted as zero."""
 
-    counted: Decision = Decision(np.inf)
-    left_out: Decision = Decision(0.0)
+    decisions: tuple[Decision, ...] = ()
 
     @property
     def kept(self) -> float:
         """Smallest singular value counted as nonzero, relative to its tolerance."""
-        return self.counted.ratio
+        return min((one.ratio for one in self.decisions if one.ratio > 1.0), default=np.inf)
 
     @property
     def dropped(self) -> float:
         """Largest singular value counted as zero, relative to its tolerance."""
-        return self.left_out.ratio
+        return max((one.ratio for one in self.decisions if one.ratio <= 1.0), default=0.0)
 
     def __and__(self, other: Margin) -> Margin:
-        """Combine two margins: keep the smallest value counted as nonzero, the largest as zero."""
-        counted = min(self.counted, other.counted, key=itemgetter(0))
-        return Margin(counted, max(self.left_out, other.left_out, key=itemgetter(0)))
+        return Margin(self.decisions + other.decisions)
 
     def transformed(self, change: Array | float, *, halved: bool = False) -> Margin:
         """Return the margin with transformed directions, ``change * v`` or ``change @ v``.
 
         If `halved`, v is the larger half of the direction: its positions or its rates.
         """
-
-        def moved(one: Decision) -> Decision:
-            if not one.at.size:
-                return one
+        moved = []
+        for one in self.decisions:
             v = max(np.split(one.at, 2), key=np.linalg.norm) if halved else one.at
-            return one._replace(at=change @ v if np.ndim(change) == 2 else change * v)
-
-        return Margin(moved(self.counted), moved(self.left_out))
+            moved.append(one._replace(at=change @ v if np.ndim(change) == 2 else change * v))
+        return Margin(tuple(moved))
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
         """Decisions within rounding error: ratio, direction, change of the number of states."""
-        counted, left_out = self
-        near = [(counted.ratio, counted.at, -counted.states)] * (self.kept < CLEAR)
-        near += [left_out] * (self.dropped > LOST)
-        return tuple(near)
-
-
-def decided(ratio: float, direction: Values, states: int = 1) -> Margin:
-    """Return the margin of a single decision."""
-    one = Decision(ratio, direction, states)
-    return Margin(counted=one) if ratio > 1.0 else Margin(left_out=one)
+        counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
+        left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
+        return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
 
 
 class FixedPoles(NamedTuple):
@@ -166,10 +152,8 @@ def right_vectors(
 
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank from singular values divided by the tolerance."""
-    margin = Margin()
-    for index in range(max(rank - 1, 0), min(rank + 1, len(ratios))):
-        margin &= decided(float(ratios[index]), vectors[:, index], states)
-    return margin
+    near = range(max(rank - 1, 0), min(rank + 1, len(ratios)))
+    return Margin(tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near))
 
 
 def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:

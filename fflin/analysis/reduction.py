@@ -1,7 +1,5 @@
 """Reduced linear models: without conserved momenta, without wheels, or of chosen states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial

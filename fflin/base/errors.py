@@ -1,7 +1,5 @@
 """Errors that fflin raises; each message gives the value, what is expected, and what to do."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Style, colours and output files of figures."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator
@@ -10,13 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from fflin.base.errors import MissingPackageError, optional_package
+from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from fflin.base.validation import Array
+else:
+    # Matplotlib is imported only when a figure is drawn.
+    Artist = Axes = Figure = object
 
 FORMATS = (".png", ".pdf", ".svg")
 
@@ -60,12 +61,13 @@ def drawing(
     if target is not None:
         check_ending(target, FORMATS)
     require_matplotlib()
-    import matplotlib
-    from matplotlib.figure import Figure
+    import matplotlib.figure
 
     style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
     with matplotlib.rc_context(style):
-        figure = Figure((width, height), layout="compressed" if compressed else "constrained")
+        figure = matplotlib.figure.Figure(
+            (width, height), layout="compressed" if compressed else "constrained"
+        )
         yield figure
         if target is not None:
             content = io.BytesIO()

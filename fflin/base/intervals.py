@@ -70,16 +70,13 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 def rank_correlations(columns: Array, values: Array) -> Array:
     """Return Spearman's correlation of each column (N, k) with values (N,), also infinite ones."""
-    ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
+    ranks = np.empty((len(values), columns.shape[1] + 1))
+    for k, column in enumerate((*columns.T, values)):
+        # Equal values share the mean of their ranks.
+        _, which, counts = np.unique(column, return_inverse=True, return_counts=True)
+        ranks[:, k] = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)
     shares = ranks / np.where(size > 0.0, size, 1.0)
     found: Array = shares[:, :-1].T @ shares[:, -1]
     return found
-
-
-def _ranks(values: Array) -> Array:
-    """Return the ranks of values; equal values share the mean of their ranks."""
-    _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ranks: Array = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
-    return ranks

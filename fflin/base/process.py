@@ -1,7 +1,5 @@
 """Progress bar on stderr, folders of the import path, and threads of BLAS."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

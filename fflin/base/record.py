@@ -274,10 +274,12 @@ class Design(Result):
         write_record(as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
-    def _of(cls: type[Kind], source: object, **own: Any) -> Kind:
-        """Return a result with `own` fields; other fields are the attributes of `source`."""
-        names = (each.name for each in fields(cls) if each.init and each.name not in own)
-        return cls(**{key: getattr(source, key) for key in names if hasattr(source, key)}, **own)
+    def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
+        """Return a result with `own` fields; others are attributes of the first source with it."""
+        names = [each.name for each in fields(cls) if each.init]
+        for source in sources:
+            own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own
+        return cls(**own)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import pinocchio as pin
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 else:
     # Importing numpy.typing would take a tenth of the start time of the command line.
+    ArrayLike = object
     Array = Complex = Values = Vector = Poles = Open = Mask = Indices = np.ndarray
 
 T = TypeVar("T")
@@ -204,18 +205,7 @@ class Result(FrozenArrays):
 
     def __repr__(self) -> str:
         """Return a title: the robot, the numbers of points and signals, and the accuracy."""
-        known = {key: getattr(self, key) for key in _TITLE if hasattr(self, key)}
-        parts = [f"'{known['robot']}'"]
-        if "__len__" in known:
-            parts.append(f"{known['__len__']()} points")
-        parts += [f"{size}={len(known[key])}" for key, size in _SIZES.items() if key in known]
-        parts += [f"{key}='{known[key]}'" for key in ("frame", "tool") if key in known]
-        if "dt" in known:
-            parts.append(f"dt={known['dt']:g} s" if known["dt"] else "continuous")
-        if "margin" in known:
-            parts.append(f"margin={np.min(known['margin']):.3g}")
-        if "residual" in known:
-            parts.append(f"residual={np.max(known['residual']):.1e}")
+        parts = [said(getattr(self, key)) for key, said in _TITLE.items() if hasattr(self, key)]
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def __str__(self) -> str:
@@ -226,14 +216,21 @@ class Result(FrozenArrays):
         return repr(self)
 
 
-_SIZES = {
-    "t": "knots",
-    "parameters": "parameters",
-    "state_names": "nx",
-    "input_names": "nu",
-    "output_names": "ny",
+# Parts of the title of a result: the text of each attribute that the result has.
+_TITLE: dict[str, Callable[[Any], str]] = {
+    "robot": "'{}'".format,
+    "__len__": lambda count: f"{count()} points",
+    "t": lambda times: f"knots={len(times)}",
+    "parameters": lambda names: f"parameters={len(names)}",
+    "state_names": lambda names: f"nx={len(names)}",
+    "input_names": lambda names: f"nu={len(names)}",
+    "output_names": lambda names: f"ny={len(names)}",
+    "frame": "frame='{}'".format,
+    "tool": "tool='{}'".format,
+    "dt": lambda dt: f"dt={dt:g} s" if dt else "continuous",
+    "margin": lambda margin: f"margin={np.min(margin):.3g}",
+    "residual": lambda residual: f"residual={np.max(residual):.1e}",
 }
-_TITLE = ("robot", "__len__", *_SIZES, "frame", "tool", "dt", "margin", "residual")
 
 
 def frozen(array: Array) -> Array:

@@ -167,12 +167,10 @@ def followed_path(target: Path) -> Path:
     return real
 
 
-def check_output_path(target: Path, endings: tuple[str, ...] = ()) -> None:
+def check_output_path(target: Path) -> None:
     """Raise `FileError` before any work is done if the target cannot be written."""
     from tempfile import TemporaryFile
 
-    if endings:
-        check_ending(target, endings)
     with _failing(target, "written"):
         TemporaryFile(prefix=".fflin-", dir=followed_path(target).parent).close()
 

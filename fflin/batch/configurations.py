@@ -3,35 +3,22 @@
 The configurations of a grid, and random configurations, are generated on demand.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import validation
 from fflin.base.errors import InputError, located
-from fflin.base.validation import (
-    NORM_TOLERANCE,
-    Array,
-    as_double,
-    dimension,
-    frozen,
-    instance,
-    vector,
-    whole,
-)
+from fflin.base.validation import Array, ArrayLike, frozen
 from fflin.dynamics.points import configuration
 from fflin.robot.fields import travel_of
 from fflin.robot.joints import ROUND_OFF, Joint, by_joint
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 # Two indices of a joint in q, and a factor. A continuous joint has the indices of (cos, sin); any
 # other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
@@ -136,22 +123,8 @@ class RandomConfigurations:
         return _placed(self.robot, self.start, stop - start, values)
 
 
-@dataclass(frozen=True, eq=False)
-class GivenConfigurations:
-    """Array (N, nq) of valid configurations."""
-
-    q: Array
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def rows(self, start: int, stop: int) -> Array:
-        """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
-        return self.q[start:stop]
-
-
-# Configurations of a sweep; the rows of a grid and random rows are generated on demand.
-Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
+# Configurations of a sweep that are generated on demand.
+Configurations: TypeAlias = Grid | RandomConfigurations
 
 
 def grid(
@@ -201,8 +174,8 @@ def grid(
                 f"joint '{name}' is on the grid and in joints=; give it in only one of the two"
             )
         what = f"grid of joint '{name}'"
-        axis = as_double(what, values)
-        vector(what, axis, max(1, axis.size), "increasing values (k,), k > 0")
+        axis = validation.as_double(what, values)
+        validation.vector(what, axis, max(1, axis.size), "increasing values (k,), k > 0")
         if (np.diff(axis) <= 0.0).any():
             raise InputError(f"{what} has values that do not increase, expected increasing numbers")
         checked[name] = frozen(axis)
@@ -254,44 +227,19 @@ def random_configurations(
     >>> len(fflin.sweep(robot, points))
     4
     """
-    count, seed = whole("count", count, 1), whole("seed", seed, 0)
+    count, seed = validation.whole("count", count, 1), validation.whole("seed", seed, 0)
     start = configuration(robot, base=base)
     ranges = {} if ranges is None else ranges
-    given = instance("ranges", ranges, Mapping, "a mapping {joint: (low, high)}")
+    given = validation.instance("ranges", ranges, Mapping, "a mapping {joint: (low, high)}")
     given = by_joint(given, robot.joint_names, robot.joint)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     return RandomConfigurations(robot, count, seed, checked, frozen(start))
 
 
-def as_configurations(robot: Robot, q: ArrayLike | Configurations) -> Configurations:
-    """Return the points of a sweep as configurations of this robot."""
-    instance("robot", robot, Robot, "a fflin.Robot")
-    if isinstance(q, GivenConfigurations):  # checked already
-        return q
-    if not isinstance(q, Grid | RandomConfigurations):
-        return GivenConfigurations(checked_configurations(robot, q))
-    # The robot may have other inputs or outputs, but its joints must be the same.
-    if q.robot.joints != robot.joints:
-        raise InputError(
-            f"q was made for '{q.robot.name}', whose joints differ from the joints of "
-            f"'{robot.name}'; make q for the robot that is swept"
-        )
-    return replace(q, robot=robot)
-
-
-def content(configurations: Configurations) -> dict[str, object]:
-    """Return all values that determine the rows, by name and in order."""
-    values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
-    of_joints = values.pop("axes", None) or values.pop("ranges", {})
-    values.pop("robot", None)
-    named = {f"{at} {name}": value for at, (name, value) in enumerate(of_joints.items())}
-    return {"of": type(configurations).__name__, **values, **named}
-
-
 def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
     if given is not None:
         what = f"range of '{joint.name}'"
-        low, high = vector(what, given, 2, "(low, high)").tolist()
+        low, high = validation.vector(what, given, 2, "(low, high)").tolist()
         if not 0.0 <= high - low < math.inf:
             said = f"{what} is {low:g} to {high:g}"
             raise InputError(f"{said}, expected low <= high with a width that does not overflow")
@@ -364,7 +312,7 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
         if robot.followers:
             followed = block.copy()
             follow_rows(robot, followed)
-            doubtful |= ~(np.abs(followed - block) <= NORM_TOLERANCE).all(axis=1)
+            doubtful |= ~(np.abs(followed - block) <= validation.NORM_TOLERANCE).all(axis=1)
         for row in np.flatnonzero(doubtful).tolist():
             with located(f"configuration {start + row}"):
                 block[row] = robot.checked_configuration(block[row])
@@ -386,7 +334,7 @@ def checked_rows(
 
     Rows with an entry that is not finite are checked, or `every` row.
     """
-    if dimension(name, given) == 1:
+    if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))
     rows = _rows(name, given, size, "one row for each point", count)
     with np.errstate(all="ignore"):
@@ -400,7 +348,7 @@ def checked_rows(
 
 
 def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None) -> Array:
-    array = as_double(name, value)
+    array = validation.as_double(name, value)
     expected = f"({'N' if count is None else count}, {size})"
     if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):
         raise InputError(f"{name} has shape {array.shape}, expected {expected}: {of_what}")

@@ -21,17 +21,10 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
+from fflin.base import writing
 from fflin.base.errors import FileError, InputError, optional_package
 from fflin.base.record import CHECKSUM, DAMAGED, content_digest, verify_checksum
 from fflin.base.validation import Array
-from fflin.base.writing import (
-    as_path,
-    check_ending,
-    check_output_path,
-    install,
-    reason,
-    replacing,
-)
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -51,13 +44,6 @@ _CHUNK_BYTES = 2**22
 _OVERHEAD = 2**16
 
 
-def check_format(path: Path) -> None:
-    """Raise an error if the file's ending is unknown, or if h5py is needed but not installed."""
-    check_ending(path, FORMATS)
-    if path.suffix == ".h5":
-        hdf5()
-
-
 def hdf5() -> ModuleType:
     """Return h5py, or raise `MissingPackageError`."""
     h5py: ModuleType = optional_package("h5py", "HDF5 files need h5py", "fast")
@@ -73,11 +59,11 @@ def write_rows(
     path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
     """Write arrays with the same number of rows, and strings, with digests if `checksummed`."""
-    check_format(path)
+    writing.check_ending(path, FORMATS)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
     texts = {**texts, "constant": json.dumps(list(constants))}
-    with replacing(path) as (new,):
+    with writing.replacing(path) as (new,):
         if path.suffix == ".npz":
             plain: dict[str, Any] = {**varying, **constants, **texts}
             if checksummed:
@@ -127,7 +113,7 @@ def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
     """Return arrays, names of the arrays with one row for all points, strings, and `verified`."""
-    check_format(path)
+    writing.check_ending(path, FORMATS)
     arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)
     return arrays, json.loads(texts["constant"]), texts, verified
 
@@ -286,7 +272,7 @@ class FileStore:
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             hint = "; if no other run uses it, remove it to start again" * self.resumed
             raise FileError(
-                f"{self.part}: cannot be read or written: {reason(error)}{hint}"
+                f"{self.part}: cannot be read or written: {writing.reason(error)}{hint}"
             ) from None
 
     def finished(self, start: int, stop: int) -> bool:
@@ -323,7 +309,7 @@ class FileStore:
                 self._texts, self.chunk, checksums, self._constants
             )
             self._file.close()
-            install(self.part, self.path)
+            writing.install(self.part, self.path)
         # This call has just written the file, so its checksums are not verified.
         return read_rows(self.path, verify=False)[0]
 
@@ -367,10 +353,12 @@ def require_room(path: Path, size: int) -> None:
 
 def output_path(out: str | Path) -> Path:
     """Return a path that can be written as a rows file, or raise `FileError`."""
-    path = as_path(out)
-    check_format(path)
-    check_output_path(path)
-    check_output_path(part_of(path))
+    path = writing.as_path(out)
+    writing.check_ending(path, FORMATS)
+    if path.suffix == ".h5":
+        hdf5()  # raises an error if h5py is not installed
+    writing.check_output_path(path)
+    writing.check_output_path(part_of(path))
     return path
 
 

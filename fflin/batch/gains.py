@@ -177,7 +177,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         found = half_size(batch.A[0], B, Q, R) if direct else None
         if found is not None:
             K[index], residual[index] = found.K, found.residual
-            margin[index] = -found.poles.real.max()
+            margin[index] = found.margin
             continue
         with located(f"point {index}"):
             gain = lqr(batch[index], Q, R)

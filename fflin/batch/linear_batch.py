@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import validation
 from fflin.base.errors import InputError, require_known
 from fflin.base.record import reading
-from fflin.base.validation import Result, frozen, number, refuse_masked, vector
+from fflin.base.validation import ArrayLike, frozen
 from fflin.base.writing import as_path
 from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
@@ -23,8 +24,6 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.base.validation import Array, Indices, Mask
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
@@ -37,7 +36,7 @@ _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearBatch(Result):
+class LinearBatch(validation.Result):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
@@ -135,7 +134,7 @@ class LinearBatch(Result):
                 raise IndexError(f"index is {index}, but the batch has {len(self)} points")
             return self._model(int(index) % len(self))
         if not isinstance(index, slice):
-            refuse_masked("index", index)
+            validation.refuse_masked("index", index)
             index = np.asarray(index)
             if index.dtype.kind not in "iub" or index.ndim != 1:
                 raise InputError(
@@ -196,7 +195,7 @@ class LinearBatch(Result):
         """
         distance = np.zeros(len(self))
         for what, column, value in self._named(joints):
-            distance += away(self.q, column, number(what, value)) ** 2
+            distance += away(self.q, column, validation.number(what, value)) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -212,11 +211,11 @@ class LinearBatch(Result):
         mask = np.ones(len(self), dtype=bool)
         for what, column, value in self._named(joints):
             if isinstance(value, tuple | list):
-                low, high = vector(what, value, 2, "(low, high)")
+                low, high = validation.vector(what, value, 2, "(low, high)")
                 at = values(self.q, column)
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, column, number(what, value)) <= _SAME
+                mask &= away(self.q, column, validation.number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"

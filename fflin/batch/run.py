@@ -50,13 +50,8 @@ Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
 class Job(Protocol):
     """Computation on rows; it is pickled, and each worker unpickles it once."""
 
-    @property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shape per row of each array of the result."""
-
-    @property
-    def threaded(self) -> bool:
-        """Whether threads of this process can compute chunks in parallel."""
+    shapes: dict[str, tuple[int, ...]]  # shape per row of each array of the result
+    threaded: bool  # whether threads of this process can compute chunks in parallel
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array], /) -> list[str]:
         """Write the results of the rows from `start` on into `out`, and return warnings."""

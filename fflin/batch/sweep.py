@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -20,14 +21,14 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, Indices, frozen, vector
+from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
 from fflin.batch.configurations import (
     Configurations,
-    GivenConfigurations,
-    as_configurations,
+    Grid,
+    RandomConfigurations,
+    checked_configurations,
     checked_rows,
     column,
-    content,
 )
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
@@ -42,8 +43,6 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
@@ -160,7 +159,6 @@ def sweep(
     """
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    points = as_configurations(robot, q)
     job = ChunkJob(
         robot,
         at_rest=v is None and u is None,
@@ -169,7 +167,7 @@ def sweep(
         reference=reference,
         moving=moving,
     )
-    task = SweepTask(job, points, v, u)
+    task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
         # All threads or workers compute equally many chunks.
@@ -216,16 +214,14 @@ class ChunkJob:
         self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
-        measured = prepared.sensing is not None
-        if checked_engine(engine) == "compiled" and measured:
+        reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
+        if reason and engine == "compiled":
             raise InputError(
-                "engine='compiled' is not possible, because the outputs are not the state; "
-                "leave engine out"
+                f"engine='compiled' is not possible, because {reason}; leave engine out"
             )
-        in_python = engine == "python" or measured or prepared.not_compilable
         # Compiled accelerations for many points at once; None if Python computes the points.
         self._kernel: RowAccelerations | None = None
-        if engine == "compiled" or not in_python:
+        if engine != "python" and not reason:
             self._kernel = prepared.kernel()
         self.threaded = self._kernel is not None
         self._data = robot.create_data()
@@ -251,7 +247,7 @@ class ChunkJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
-        left = self.write(rows, out) if self._kernel else np.arange(len(rows["q"]))
+        left = self.write(rows, out)
         if not len(left):
             return []
         with _TURN, warnings.catch_warnings(record=True) as caught:
@@ -280,10 +276,11 @@ class ChunkJob:
             np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write rows in compiled code; return the rows for which this is not accurate."""
+        """Write rows in compiled code; return the rows for which it is not accurate or possible."""
         kernel, q = self._kernel, rows["q"]
-        assert kernel is not None
         count = len(q)
+        if kernel is None:
+            return np.arange(count)
         if count < LANES:  # fill up the lanes by repeating the last row
             filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
             for key, array in out.items():
@@ -318,7 +315,7 @@ class ChunkJob:
         A[:, :nv] = ready.rest["A"][:nv]
         c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
-        f0 = assemble(state, actuation, chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0
         if ready.moving:
@@ -337,15 +334,26 @@ class SweepTask:
     def __init__(
         self,
         job: ChunkJob,
-        configurations: Configurations,
+        q: ArrayLike | Configurations,
         v: ArrayLike | None,
         u: ArrayLike | None,
     ) -> None:
         self.job, self.robot = job, (robot := job.linearizer.robot)
-        self.configurations, self.count = configurations, (count := len(configurations))
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
-        # Rows that are known before the sweep; a velocity or input of all points is one row.
-        self._known: dict[str, Array] = {}
+        # Points that are generated on demand, and rows that are known before the sweep; a velocity
+        # or input of all points is one row.
+        self._points, self._known = None, dict[str, Array]()
+        if isinstance(q, Grid | RandomConfigurations):
+            # The robot may have other inputs or outputs, but its joints must be the same.
+            if q.robot.joints != robot.joints:
+                raise InputError(
+                    f"q was made for '{q.robot.name}', whose joints differ from the joints of "
+                    f"'{robot.name}'; make q for the robot that is swept"
+                )
+            self._points = replace(q, robot=robot)
+        else:
+            self._known["q"] = checked_configurations(robot, q)
+        self.count = count = len(self._points or self._known["q"])
         if v is not None:
             every = bool(robot.followers)
             check = robot.checked_velocity
@@ -356,8 +364,6 @@ class SweepTask:
             self._known["u0"] = checked_rows("u", u, nu, of_inputs, count)
         # The known arrays that vary between points, and the shapes per point of all that do.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
-        if isinstance(configurations, GivenConfigurations):
-            self.given["q"] = configurations.q
         self.shapes = {**job.shapes, "q": (robot.nq,)}
         self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
         constants: dict[str, Array] = {
@@ -374,8 +380,8 @@ class SweepTask:
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
         """Return points start to stop - 1."""
-        q = self.configurations.rows(start, stop)
-        return {"q": q, **{key: rows[start:stop] for key, rows in self._known.items()}}
+        drawn = {"q": self._points.rows(start, stop)} if self._points else {}
+        return {**drawn, **{key: rows[start:stop] for key, rows in self._known.items()}}
 
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
         """Assemble a batch from the arrays that vary between points."""
@@ -406,12 +412,17 @@ class SweepTask:
         settings += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
         settings += [prepared.map.frame, prepared.moving, prepared.own_reference]
         settings += [self.job.only_inertia, __version__, pin.__version__, self.count]
+        points = dict(vars(self._points)) if self._points else {}
+        settings += [type(self._points).__name__]
+        points.pop("robot", None)
+        axes = points.pop("axes", None) or points.pop("ranges", {})
+        points |= {f"{at} {name}": value for at, (name, value) in enumerate(axes.items())}
         return content_digest(
             {
                 "robot": repr(settings),
                 "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
                 "reference": prepared.reference,
                 **self._known,
-                **{f"of q: {key}": value for key, value in content(self.configurations).items()},
+                **{f"of q: {key}": value for key, value in points.items()},
             }
         )

@@ -21,8 +21,8 @@ from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
+from fflin.campaign.runs import KINDS, kind_named
 from fflin.campaign.spreads import SEED
-from fflin.campaign.statistics import KINDS, kind_named
 from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:
@@ -221,22 +221,17 @@ class Campaign(FrozenArrays):
         states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
-            "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
-            "worst": [
-                (*kinds, self._beyond(self.largest)),
-                (*states, self._beyond(self.largest_x)),
-                (*inputs, self._beyond(self.largest_u)),
-            ],
+            "final": [(*kinds, self.errors), (*states, self.x), (*inputs, self.u)],
+            "worst": [(*kinds, self.largest), (*states, self.largest_x), (*inputs, self.largest_u)],
             "settle": [(kinds[0], ("s",) * len(KINDS), self.settle)],
             "drawn": [(self.names, ("",) * len(self.names), self.drawn)],
         }[of]
         for names, units, arrays in groups:
             if rest in names:
-                return arrays[:, names.index(rest)], units[names.index(rest)]
+                values, unit = arrays[:, names.index(rest)], units[names.index(rest)]
+                bounded = of == "worst" or arrays is self.errors
+                return (np.where(self.stopped, np.inf, values) if bounded else values), unit
         raise unknown("figure", rest, [each for names, *_ in groups for each in names])
-
-    def _beyond(self, sizes: Array) -> Array:
-        return np.where(self.stopped[:, None], np.inf, sizes)
 
     def met(self, condition: object) -> Mask:
         """Return a mask (N,) of the runs that meet a condition.

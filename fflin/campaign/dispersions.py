@@ -1,7 +1,5 @@
 """Dispersions: random values by name, and the robots and initial states that follow from them."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from copy import copy
@@ -144,9 +142,8 @@ class Dispersions:
                 spreads, written = self._by_piece(kind, spreads)
             found = by_name(f"{kind} to disperse", spreads, names)
         except UnknownNameError as error:
-            raise UnknownNameError(
-                f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
-            ) from None
+            hint = f"; or NAME.({kinds})" * (kind == "state")
+            raise UnknownNameError(f"{error}{hint}") from None
         nominal, of_modes = robot.springs._asdict(), robot.springs.stiffness[self._modes]
         factors = {**nominal, "frequency": of_modes}.get(kind)
         draws: dict[str, tuple[Inverse, list[int]]] = {}

@@ -7,32 +7,19 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import validation
 from fflin.base.errors import InputError, require_known
 from fflin.base.intervals import until_failure
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
-from fflin.base.validation import (
-    Array,
-    Vector,
-    as_double,
-    by_name,
-    dimension,
-    instance,
-    number,
-    positive,
-    share,
-    vector,
-    whole,
-)
+from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
+from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -40,9 +27,6 @@ from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
@@ -197,7 +181,7 @@ class Funnel(Design):
 
     def level(self, t: float) -> float:
         """Return rho at time t; between two knots, the smaller of their two levels."""
-        t = number("t", t)
+        t = validation.number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
         near = [self.t.searchsorted(t, side) - (side == "right") for side in ("right", "left")]
@@ -362,12 +346,13 @@ def funnel(
     >>> len(reach.rho)
     2
     """
-    instance("robot", robot, Robot, "a fflin.Robot")
-    expected = "a GainSchedule or a TrajectoryFeedback"
-    feedback = instance("schedule", followed(schedule, robot), TrajectoryFeedback, expected)
+    validation.instance("robot", robot, Robot, "a fflin.Robot")
+    policy, expected = followed(schedule, robot), "a GainSchedule or a TrajectoryFeedback"
+    feedback = validation.instance("schedule", policy, TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
-    samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
-    confidence = share("confidence", confidence)
+    samples = validation.whole("samples", samples, 1, _MOST)
+    seed = validation.whole("seed", seed, 0)
+    confidence = validation.share("confidence", confidence)
     by_level = not isinstance(goal, Mapping)
     final = _bounds("goal", {"level": goal} if by_level else goal, ["level"] if by_level else KINDS)
     limits = _bounds("within", {} if within is None else within, KINDS)
@@ -479,14 +464,14 @@ def runs_from(
 
 def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
     """Return {kind: largest error} from a given mapping, or raise `InputError`."""
-    given = {kind_named(str(key)): x for key, x in by_name(name, given, "kind").items()}
+    given = {kind_named(str(key)): x for key, x in validation.by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
         raise InputError(
             "goal is empty; give the largest final error of at least one kind, such as "
             "{'attitude': 1.0} in deg"
         )
-    return {key: positive(f"{name} '{key}'", value) for key, value in given.items()}
+    return {key: validation.positive(f"{name} '{key}'", value) for key, value in given.items()}
 
 
 def _shown(bounds: Mapping[str, float]) -> str:
@@ -506,11 +491,12 @@ def _indices(
             "no time of the schedule is a knot of the trajectory; design the schedule on this "
             "trajectory"
         )
-    if dimension("knots", knots) == 0:
-        chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]
+    if validation.dimension("knots", knots) == 0:
+        count = validation.whole("knots", knots, 1)
+        chosen = both[np.linspace(0, len(both) - 1, count).round().astype(int)]
     else:
-        times = as_double("knots", knots).ravel()
-        times = vector("knots", times, times.size, "times of knots")
+        times = validation.as_double("knots", knots).ravel()
+        times = validation.vector("knots", times, times.size, "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
         raise InputError("knots is empty; give the number of knots, or a list of times [s]")

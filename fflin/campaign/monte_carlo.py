@@ -1,7 +1,5 @@
 """Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle
@@ -19,19 +17,11 @@ from fflin.base import __version__
 from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import instance, share, truth, whole
-from fflin.batch.files import (
-    FileStore,
-    MemoryStore,
-    output_path,
-    part_of,
-    read_rows,
-    require_room,
-)
+from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
-from fflin.campaign.runs import CampaignJob, chunk_size, expect
+from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import KINDS
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions
@@ -206,16 +196,16 @@ def monte_carlo(
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
     width, confidence = share("width", width), share("confidence", confidence)
     how = Execution(executor, workers, threads, chunk, progress)
-    path = None if out is None else output_path(out)
+    path = None if out is None else files.output_path(out)
     options |= {"duration": duration, "histories": whole("histories", histories, 0)}
     job = CampaignJob(robot, policy, dispersions, seed, engine, options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     size = _chunk(runs, chunk, how.count(job), staged=until is not None)
-    store: MemoryStore | FileStore | None = None
+    store: files.MemoryStore | files.FileStore | None = None
     if path is None or path.suffix == ".npz":
-        store = MemoryStore(runs, size, shapes)
-    elif not part_of(path).exists():
-        require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
+        store = files.MemoryStore(runs, size, shapes)
+    elif not files.part_of(path).exists():
+        files.require_room(path, 8 * runs * sum(map(math.prod, shapes.values())))
     if how.executor:
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
@@ -231,7 +221,7 @@ def monte_carlo(
             return replace(earlier, goals=wanted, confidence=confidence, _job=job)
         if store is None:
             texts = {"header": json.dumps(header), "constant": "[]"}
-            store = FileStore(path, request, runs, size, shapes, {}, texts)
+            store = files.FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
     made = partial(Campaign.of, header=header, job=job)
     with closing(store), how:
@@ -294,7 +284,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
     if not path.is_file():
         return None
     with suppress(FileError), reading(path, "Campaign"):
-        if read_rows(path, verify=False)[2].get("request") == request:
+        if files.read_rows(path, verify=False)[2].get("request") == request:
             return Campaign.load(path)
     raise FileError(
         f"{path} exists and was not written by this call; name another file, or replace the file "
@@ -304,8 +294,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 def _header(job: CampaignJob) -> dict[str, object]:
     """Return the header of a campaign: everything that is not an array."""
-    plan, plant = job.plan, job.plant
-    robot = plant.robot
+    plan, plant, robot = job.plan, job.plant, job.plant.robot
     others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
     steered -= set() if pushed(plant.actuation) else {"r_b"}
@@ -318,8 +307,8 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "input_names": plant.actuation.names,
         "input_units": plant.actuation.units,
         "judged": [kind for kind, group in groups if group in steered],
-        "robot": plant.robot.name,
-        "urdf_sha256": plant.robot.urdf_sha256,
+        "robot": robot.name,
+        "urdf_sha256": robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,
         "dt": plan.times.dt,
         "engine": job.engine,

@@ -1,25 +1,19 @@
 """Figures of campaigns, of the validity of a linear model, and of funnels."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from fflin.base.figures import COLORS, drawing
+from fflin.base.figures import COLORS, Axes, Figure, drawing
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
 from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import TRUSTED, Validity, shown
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # For each band: fraction of runs outside it on each side, name and opacity; widest band first.
 _BANDS = (
@@ -122,38 +116,35 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     percent = 100.0
     with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
-        measured = np.isfinite(validity.prediction_error)
-        levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
         # The figure shows the error relative to the displacement. Its order is therefore one less
         # than the order of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
-        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
+        levels, errors = percent * validity.levels, percent * validity.prediction_error
+        left.loglog(levels, errors, "o-", color=COLORS[0], ms=3, label=order)
         trust = f"accepted error: {percent * TRUSTED:g} %"
         left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
-        left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
+        left.set_xticks(levels, [f"{x:.3g}" for x in levels])
         left.minorticks_off()
         left.set(
-            title="prediction error of the linear loop",
-            xlabel="displacement [% of the largest]",
-            ylabel="error [% of the displacement]",
+            title="prediction error of the linear loop", ylabel="error [% of the displacement]"
         )
-
         settled = np.array([outcome == "settled" for outcome in validity.outcomes])
-        edges = np.linspace(0.0, 1.0, 11)
-        counts = [np.histogram(validity.sampled[at], edges)[0] for at in (settled, ~settled)]
-        middles, wide = percent * (edges[1:] + edges[:-1]) / 2.0, percent * 0.09
-        right.bar(middles, counts[0], wide, color=COLORS[2], label="settled")
-        right.bar(middles, counts[1], wide, bottom=counts[0], color=COLORS[1], label="not settled")
-        low, high = validity.rate
-        right.set(
-            title=f"{validity.settled} of {len(settled)} runs settled",
-            xlabel="displacement [% of the largest]",
-            ylabel="runs",
+        tried = percent * validity.sampled
+        right.hist(
+            [tried[settled], tried[~settled]],
+            np.linspace(0.0, percent, 11).tolist(),
+            stacked=True,
+            rwidth=0.9,
+            color=[COLORS[2], COLORS[1]],
+            label=["settled", "not settled"],
         )
+        right.set(title=f"{validity.settled} of {len(settled)} runs settled", ylabel="runs")
         right.yaxis.get_major_locator().set_params(integer=True)
-        right.set_ylim(0.0, 1.05 * float(np.add(*counts).max()))
+        for axes in (left, right):
+            axes.set_xlabel("displacement [% of the largest]")
+        low, high = validity.rate
         figure.legend(loc="outside lower center", ncols=4)
         figure.suptitle(
             f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "

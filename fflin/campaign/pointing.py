@@ -1,7 +1,5 @@
 """Misaligned inputs: actual directions of thrusters, wheels, torques and forces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

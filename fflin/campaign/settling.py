@@ -4,11 +4,8 @@ The norm is the square root of a Lyapunov function of the linear loop. The rate 
 minus a quadratic form in units of energy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,8 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, Judge
+from fflin.campaign.runs import EDGE, CampaignJob, Judge, completed
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -43,43 +39,45 @@ _CHECKS = 60  # comparisons with the prediction in a run
 OUTCOMES = ("slow", "settled", "chart", "diverged")
 
 
-@dataclass(frozen=True, eq=False)
 class Loop:
-    """Robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` of the model's states z."""
+    """Regulated robot: its model, and the feedback ``u = u0 - K (z - z0)`` of the model's states z.
 
-    robot: Robot
-    lin: LinearModel  # whole or reduced; sampled if its input is held
-    K: Array  # (nu, nz)
+    `InputError` is raised if the loop cannot settle at the operating point.
+    """
 
-    @cached_property
-    def state(self) -> StateMap:
-        """Map of the full state of the robot, in the axes of the model."""
-        return StateMap(self.robot, reference=self.lin.reference, frame=self.lin.frame)
-
-    @cached_property
-    def start(self) -> Array:
-        """State (nx,) at the operating point."""
-        return self.state.to_state(self.lin.q, self.lin.v)
-
-    @cached_property
-    def model_states(self) -> Array:
-        """Indices of the model's states in the full state."""
-        names = self.state.names
-        return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
-
-    @cached_property
-    def rate(self) -> Array:
-        """State matrix of the linear loop, A - B K."""
-        closed: Array = self.lin.A - self.lin.B @ self.K
-        return closed
-
-    @cached_property
-    def decay(self) -> float:
-        """Slowest decay rate [1/s] of the linear loop; not positive if the loop is unstable."""
+    def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
+        instance("robot", robot, Robot, "a fflin.Robot")
+        instance("lin", lin, LinearModel, "a fflin.LinearModel")
+        K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
+        kept = getattr(gain, "regulated", ())
+        part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
+        if part.state_names == kept:  # states that are not fed back do not settle
+            K, lin = K @ selection(kept, lin.state_names).T, part
+        self.robot, self.lin, self.K = robot, lin, K
+        # Map of the full state of the robot, in the axes of the model.
+        self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        require_fit(lin, robot, state)
+        if not len(lin.x0):
+            raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
+        if lin.moving or not lin.is_equilibrium() or lin.v.any():
+            raise InputError(
+                "the operating point is not an equilibrium at rest, so the loop cannot settle "
+                "there; linearise about an equilibrium"
+            )
+        # State (nx,) at the operating point, and indices of the model's states in it.
+        self.start = state.to_state(lin.q, lin.v)
+        self.model_states = np.array([state.names.index(name) for name in lin.state_names])
+        # State matrix of the linear loop, and its slowest decay rate [1/s].
+        self.rate: Array = lin.A - lin.B @ K
         poles = np.linalg.eigvals(self.rate)
-        if self.lin.dt:
-            return -math.log(max(float(np.abs(poles).max()), 1e-300)) / self.lin.dt
-        return -float(poles.real.max())
+        self.decay = -float(poles.real.max())
+        if lin.dt:
+            self.decay = -math.log(max(float(np.abs(poles).max()), 1e-300)) / lin.dt
+        if not self.decay > 0.0:
+            raise InputError(
+                f"the linear loop is not stable: a mode grows at {-self.decay:.3g} 1/s; "
+                "design the gain with fflin.lqr"
+            )
 
     @cached_property
     def weight(self) -> Array:
@@ -224,29 +222,3 @@ def settle(
         if not len(left):
             break
     return arrays
-
-
-def checked_loop(robot: Robot, lin: LinearModel, gain: object) -> Loop:
-    """Return the loop of a gain; raise `InputError` if it cannot settle at the operating point."""
-    instance("robot", robot, Robot, "a fflin.Robot")
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
-    kept = getattr(gain, "regulated", ())
-    part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
-    if part.state_names == kept:  # states that are not fed back do not settle
-        K, lin = K @ selection(kept, lin.state_names).T, part
-    loop = Loop(robot, lin, K)
-    require_fit(lin, robot, loop.state)
-    if not len(lin.x0):
-        raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
-    if lin.moving or not lin.is_equilibrium() or lin.v.any():
-        raise InputError(
-            "the operating point is not an equilibrium at rest, so the loop cannot settle there; "
-            "linearise about an equilibrium"
-        )
-    if not loop.decay > 0.0:
-        raise InputError(
-            f"the linear loop is not stable: a mode grows at {-loop.decay:.3g} 1/s; "
-            "design the gain with fflin.lqr"
-        )
-    return loop

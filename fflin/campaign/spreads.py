@@ -1,7 +1,5 @@
 """Spreads of random values, from Python or a TOML file, as inverse distribution functions."""
 
-from __future__ import annotations
-
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext

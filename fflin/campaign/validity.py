@@ -1,7 +1,5 @@
 """Validity of a linear model: its prediction error, and settling of its closed loop."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from concurrent.futures import Executor
@@ -16,7 +14,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
-from fflin.campaign.settling import OUTCOMES, PATIENCE, checked_loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle, settling_runs
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -227,7 +225,7 @@ def validity(
     >>> reach.inside <= 4, len(reach.outcomes)
     (True, 4)
     """
-    loop = checked_loop(robot, lin, gain)
+    loop = Loop(robot, lin, gain)
     largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = share("confidence", confidence)

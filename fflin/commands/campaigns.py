@@ -14,10 +14,9 @@ import fflin
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import Progress
 from fflin.base.tables import folded
+from fflin.commands.control import along, check_pictures, designed, loop_of, pictures
 from fflin.commands.points import limits_of_options, load_robot, once, reference_of, state_of
-from fflin.commands.regulator import designed
 from fflin.commands.results import Report
-from fflin.commands.simulation import along, check_pictures, loop_of, pictures
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array

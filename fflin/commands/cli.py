@@ -30,10 +30,8 @@ TASKS = {
 
 # {command: module}; `models` has all other commands.
 _MODULES = {
-    **dict.fromkeys(("analyze", "modes", "equilibrium", "sensitivity", "uncertain"), "analysis"),
     **dict.fromkeys(("montecarlo", "validity", "funnel", "sweep"), "campaigns"),
-    **dict.fromkeys(("lqr", "tvlqr", "export"), "regulator"),
-    **dict.fromkeys(("plan", "simulate", "view"), "simulation"),
+    **dict.fromkeys(("lqr", "tvlqr", "plan", "simulate", "export", "view"), "control"),
 }
 
 

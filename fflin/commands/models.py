@@ -1,4 +1,4 @@
-"""Commands `robots`, `info`, `init`, `linearize` and `check`."""
+"""Commands for one robot or one linear model: from `robots` and `linearize` to `uncertain`."""
 
 from __future__ import annotations
 
@@ -7,21 +7,30 @@ import os
 import textwrap
 import warnings
 from argparse import Namespace
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import fflin
-from fflin.base.errors import FflinError, FflinWarning, FileError, InputError
+from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
 from fflin.base.names import runs
-from fflin.base.tables import cut, grid, matrix, signals, width
+from fflin.base.tables import counted, cut, folded, grid, matrix, signals, width
 from fflin.base.writing import check_ending, check_output_path, write_atomically
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.points import linear_model, load_robot, models_along, refuse, state_of
+from fflin.commands.points import (
+    linear_model,
+    load_robot,
+    models_along,
+    once,
+    point_of,
+    refuse,
+    state_of,
+)
 from fflin.commands.results import Report
 
-if TYPE_CHECKING:
-    from fflin.base.validation import Array
+# Rates [SI] below this value count as zero.
+_MOVES = 1e-9
+
+_SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
 
 
 def robots(_: Namespace) -> Report:
@@ -33,20 +42,21 @@ def robots(_: Namespace) -> Report:
     from fflin.robot.summary import robot_list
 
     entries: list[tuple[str, fflin.Robot | str, str]] = []
-    result: dict[str, dict[str, object]] = {}
     for name in fflin.list_robots():
         found = find_robot(name)
+        robot: fflin.Robot | str
         try:
             with warnings.catch_warnings():
                 # Do not show these warnings here; `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 robot = fflin.load(name)
-            entries.append((name, robot, found.origin))
-            result[name] = {"n": robot.n, "mass": robot.mass}
         except FflinError as error:
-            reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
-            entries.append((name, reason, found.origin))
-            result[name] = {"error": reason}
+            robot = str(error).replace(f"{found.path.parent}{os.sep}", "")
+        entries.append((name, robot, found.origin))
+    result = {
+        name: {"error": of} if isinstance(of, str) else {"n": of.n, "mass": of.mass}
+        for name, of, _ in entries
+    }
     return Report(None, {"robots": result}, robot_list(entries))
 
 
@@ -171,10 +181,6 @@ def check(arguments: Namespace) -> Report:
     return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
 
 
-# Rates [SI] below this value count as zero.
-_MOVES = 1e-9
-
-
 def model_report(lin: fflin.LinearModel) -> str:
     """Format a linear model: its operating point, A, B, C, D and its certificate."""
     import numpy as np
@@ -203,13 +209,16 @@ def model_report(lin: fflin.LinearModel) -> str:
     )
     if moved := [signals(*vector) for vector in vectors if vector[1].any()]:
         parts.append("\n".join(moved))
-    parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
-    parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
-    if lin.output_names == lin.state_names and not lin.D.any():
+    x, u, y = lin.state_names, lin.input_names, lin.output_names
+    matrices = [("A", x, x), ("B", x, u), ("C", y, x), ("D", y, u)]
+    of_states = y == x and not lin.D.any()
+    for title, rows, columns in matrices[:2] if of_states else matrices:
+        values, text = getattr(lin, title), f"{title} ({len(rows)} x {len(columns)})"
+        if values.any():
+            text += "; rows and columns of zeros are not shown\n\n"
+        parts.append(text + (matrix(values, rows, columns) if values.any() else " is zero"))
+    if of_states:
         parts.append("C = I, D = 0: the output is the state")
-    else:
-        parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
-        parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
     c = lin.certificate
     parts.append(
         f"relative error compared with ABA derivatives: A {c.route_A:.1e}, B "
@@ -219,20 +228,13 @@ def model_report(lin: fflin.LinearModel) -> str:
     return "\n\n".join(parts)
 
 
-def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    size = f"{title} ({values.shape[0]} x {values.shape[1]})"
-    if not values.any():
-        return f"{size} is zero"
-    return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
-
-
 def _units(lin: fflin.LinearModel) -> str:
     """Return the units of the states, inputs and outputs, once for each group of names."""
-    signals = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
+    signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
     if lin.output_names != lin.state_names:
-        signals.append(("y", lin.output_names, lin.output_units))
+        signals["y"] = lin.output_names, lin.output_units
     lines = []
-    for title, names, units in signals:
+    for title, (names, units) in signals.items():
         groups = ", ".join(
             f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
             for first, last, group, of in runs(names, units)
@@ -243,3 +245,148 @@ def _units(lin: fflin.LinearModel) -> str:
 
 def _rate(unit: str) -> str:
     return "1/s" if unit == "1" else f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+
+
+def analyze(arguments: Namespace) -> Report:
+    """Show controllability, conserved momenta, modes and observability of a linear model.
+
+    example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
+    """
+    _, lin = linear_model(arguments)
+    moved, shown, found = fflin.controllability(lin), fflin.observability(lin), fflin.modes(lin)
+    parts = {"inputs": moved, "momentum": _momentum(lin), "modes": found, "outputs": shown}
+    nx = len(lin.A)
+    head = [
+        "controllable" if moved.dimension == nx else f"not controllable ({moved.dimension}/{nx})",
+        "observable" if shown.dimension == nx else f"not observable ({shown.dimension}/{nx})",
+        counted(len(found.unstable), "unstable pole"),
+    ]
+    sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
+    result = {"controllability": moved, "observability": shown, "modes": found}
+    text = "\n\n".join([", ".join(head), *sections])
+    files = {arguments.plot: lambda path: fflin.plot_modes(found, path)}
+    return Report(lin.robot, result, text, files)
+
+
+def modes(arguments: Namespace) -> Report:
+    """Show natural frequencies, damping ratios, kinetic energies and effective masses.
+
+    example: fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100
+    """
+    robot, lin = linear_model(arguments)
+    found = fflin.modes(lin)
+    result: dict[str, object] = {"modes": found}
+    if any(robot.stiffness.values()):
+        result["effective_masses"] = fflin.effective_masses(lin)
+    parts = [str(part) for part in result.values()]
+    if robot.orbit and not found.equilibrium:
+        parts.append(
+            "for the modes about an equilibrium in orbit, add --equilibrium or "
+            "--relative-equilibrium"
+        )
+    files = {
+        arguments.plot: lambda path: fflin.plot_modes(found, path),
+        arguments.html: lambda path: fflin.visualize(robot, found, html=path),
+    }
+    return Report(robot.name, result, "\n\n".join(parts), files)
+
+
+def equilibrium(arguments: Namespace) -> Report:
+    """Show whether an operating point is stable, its holding inputs, and its spring deflections.
+
+    example: fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01
+    """
+    from fflin.base.record import write_record
+    from fflin.robot.fields import limits_of
+
+    refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
+    robot = load_robot(arguments)
+    q, v, reference = point_of(robot, arguments, robot.point)
+    axes = {"frame": arguments.frame, "reference": reference}
+    held = fflin.equilibrium(robot, q, v=v, **axes)
+    lin = fflin.linearize(robot, held.q, v, held.u, **axes)
+    found = fflin.modes(lin)
+    poles = found.poles
+    growth = float(poles.real.max(initial=-math.inf))
+    decays = not found.zero_eigenvalues and all(mode.margin < -1.0 for mode in found.modes)
+    stability = "unstable" if found.unstable else "stable" if decays else "marginally stable"
+    lines = [
+        f"{robot.name}: {stability}; the largest real part of a pole is {growth:.3g} 1/s, "
+        f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
+        signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
+        str(held),
+    ]
+    names = (*lin.state_names, *lin.input_names)
+    there = dict(zip(names, (*lin.x0, *held.u), strict=True))
+    limits = limits_of(robot).items()
+    excess = {k: max(low - there[k], there[k] - high) for k, (low, high) in limits if k in there}
+    beyond = [name for name, size in excess.items() if size > _SLACK]
+    if beyond:
+        lines.append(folded([f"beyond their limits: {listed(beyond)}"]))
+    result = {
+        **vars(held),
+        "beyond_limits": beyond,
+        "state_names": lin.state_names,
+        "state_units": lin.state_units,
+        "x0": lin.x0,
+        "stability": stability,
+        "largest_real_part": growth,
+        "zero_eigenvalues": found.zero_eigenvalues,
+        "poles": poles,
+    }
+    entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
+    write = partial(write_record, record=entries, checksummed=True)
+    return Report(robot.name, result, "\n".join(lines), {arguments.output_file: write})
+
+
+def _momentum(lin: fflin.LinearModel) -> str:
+    try:
+        reduced = fflin.momentum_reduction(lin)
+    except InputError as error:
+        return folded([f"no reduction: {error}"])
+    if len(reduced.momenta):
+        components = counted(len(reduced.momenta), "component")
+        text = (
+            f"{components} of the momentum cannot be changed by any input; the model reduced "
+            f"by the conserved momentum has {len(reduced.A)} states"
+        )
+    elif not lin.is_equilibrium():
+        text = "no momentum can be removed, because the operating point is not an equilibrium"
+    else:
+        orbit = "the orbit, " * bool(lin.mean_motion)
+        text = (
+            f"no momentum is conserved, because {orbit}inputs, springs or dampers change every "
+            "component of the momentum"
+        )
+    return folded([text, *(f"note: {note}" for note in reduced.notes)])
+
+
+def sensitivity(arguments: Namespace) -> Report:
+    """Show or save the derivatives of A and B with respect to the parameters of the robot.
+
+    example: fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat
+    """
+    from fflin.uncertainty.sensitivity import sensitivity_record
+
+    _, lin = linear_model(arguments)
+    found = fflin.sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
+    text = found.table(arguments.top, arguments.only)
+    return Report(lin.robot, sensitivity_record(found), text, {arguments.output_file: found.save})
+
+
+def uncertain(arguments: Namespace) -> Report:
+    """Show or save the exact linear-fractional model (LFT) of an uncertain robot at rest.
+
+    example: fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120
+    -o uncertain.mat
+    """
+    robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
+    q, v = state_of(robot, arguments, robot.point)
+    if v is not None:
+        text = (
+            "the uncertain model describes the robot at rest, so the velocity in [point] of "
+            "robot.toml is ignored"
+        )
+        warnings.warn(text, FflinWarning, stacklevel=2)
+    lft = fflin.uncertain(robot, ranges).lft(q)
+    return Report(robot.name, lft, str(lft), {arguments.output_file: lft.save})

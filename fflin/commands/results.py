@@ -77,31 +77,26 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             written.append(path)
     finally:
         if arguments.json:
-            print(json.dumps(_record(command, report, written), allow_nan=False))
+            head: dict[str, object] = {
+                "fflin": __version__,
+                "command": command,
+                "robot": report.robot,
+                "result": first_paragraph(report.text),
+                "files": [str(path) for path in written],
+            }
+            result = plain(report.result)
+            assert isinstance(result, dict)
+            # The entries of every command come first, and are not replaced by the result's.
+            print(json.dumps(head | result | head, allow_nan=False))
         else:
-            print("\n".join([headed(command, report.text), *map(_wrote, written)]))
+            lines = [headed(command, report.text)]
+            for path in written:
+                size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
+                lines.append(f"wrote {path}{size}")
+            print("\n".join(lines))
     if report.interrupted:
         raise KeyboardInterrupt("; ".join(said))
     return report.code
-
-
-def _wrote(path: Path) -> str:
-    size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
-    return f"wrote {path}{size}"
-
-
-def _record(command: str, report: Report, files: list[Path]) -> dict[str, object]:
-    """Return the JSON object of --json: entries of every command, then the fields of the result."""
-    head: dict[str, object] = {
-        "fflin": __version__,
-        "command": command,
-        "robot": report.robot,
-        "result": first_paragraph(report.text),
-        "files": [str(path) for path in files],
-    }
-    result = plain(report.result)
-    assert isinstance(result, dict)
-    return head | result | head
 
 
 def plain(value: object) -> object:

@@ -1,7 +1,5 @@
 """Mass properties of a robot at an operating point, and authority of its wheels and thrusters."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations, islice
 from typing import NamedTuple
@@ -24,6 +22,8 @@ _MANY = 36  # thrusters; their zonotope has 400 000 facets
 _ROUNDING = 1e-9
 
 _AXES = "xyz"
+
+_ORIGIN = np.eye(7)[6]  # position and quaternion of the base
 
 
 class WheelMomentum(NamedTuple):
@@ -107,55 +107,39 @@ class PointProperties(NamedTuple):
 
 def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
     """Return mass properties and properties of wheels and thrusters at q and v."""
-    center, inertia = mass_properties(robot, q)
-    of_equipment = wheel_momentum(robot, q, v), thruster_authority(robot, q, center)
+    # With the base at the origin, world axes are base axes.
+    data, q = robot.create_data(), np.concatenate((_ORIGIN, q[7:]))
+    pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
+    center, inertia = data.com[0].copy(), np.array(data.Ig.inertia)
+    of_equipment = wheel_momentum(robot, data, v), thruster_authority(robot, q, center)
     return PointProperties(center, inertia, np.linalg.eigvalsh(inertia), *of_equipment)
 
 
-def mass_properties(robot: Robot, q: Array) -> tuple[Array, Array]:
-    """Return the centre of mass (3,) [m] and the inertia (3, 3) [kg m^2] about it, in base axes."""
-    data, q = robot.create_data(), _at_origin(q)
-    pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
-    return data.com[0].copy(), np.array(data.Ig.inertia)
-
-
-def wheel_momenta(robot: Robot, q: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Return axes (3, k) of the wheels in base axes, their momenta (k,) and largest momenta (k,).
-
-    Momenta [N m s] are relative to the carriers of the wheels.
-    """
-    data = robot.create_data()
-    pin.forwardKinematics(robot.model, data, _at_origin(q))
-    limits, axes, stored, largest = limits_of(robot), [], [], []
-    for name, wheel in named_wheels(robot.inputs):
+def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
+    """Return the total momentum of the wheels relative to their carriers, and what they store."""
+    limits, wheels, axes = limits_of(robot), named_wheels(robot.inputs), np.zeros((0, 3))
+    stored, largest = np.zeros((2, len(wheels)))
+    for k, (name, wheel) in enumerate(wheels):
         joint, axis = carrier(robot.model, wheel)
-        axes.append(data.oMi[joint].rotation @ axis)
+        axes = np.vstack((axes, data.oMi[joint].rotation @ axis))
+        stored[k], largest[k] = wheel.momentum, math.inf
         if wheel.inertia:
-            stored.append(wheel.inertia * v[robot.joint(name).idx_v])
-            largest.append(wheel.inertia * limits.get(f"qdot_m.{name}", (0.0, math.inf))[1])
-        else:
-            stored.append(wheel.momentum)
-            largest.append(math.inf)
-    return np.array(axes).reshape(-1, 3).T, np.array(stored), np.array(largest)
-
-
-def wheel_momentum(robot: Robot, q: Array, v: Array) -> WheelMomentum:
-    """Return the total momentum of the wheels, and the momentum that they can store."""
-    axes, stored, largest = wheel_momenta(robot, q, v)
-    rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if stored.size else 0
+            most = limits.get(f"qdot_m.{name}", (0.0, math.inf))[1]
+            stored[k], largest[k] = wheel.inertia * np.array((v[robot.joint(name).idx_v], most))
+    rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if len(wheels) else 0
     bounded = rank == 3 and np.isfinite(largest).all()
-    least = least_reach(axes, -largest, largest, np.eye(3)) if bounded else None
-    return WheelMomentum(stored.size, axes @ stored, rank, least)
+    least = least_reach(axes.T, -largest, largest, np.eye(3)) if bounded else None
+    return WheelMomentum(len(wheels), stored @ axes, rank, least)
 
 
 def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:
-    """Return the authority of the thrusters about a centre of mass (3,)."""
+    """Return the authority of the thrusters about a centre of mass (3,); base at the origin."""
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
     count = len(thrusters)
     if not count:
         return ThrusterAuthority(0)
-    W = actuation.columns(robot.create_data(), _at_origin(q))[:6, thrusters]
+    W = actuation.columns(robot.create_data(), q)[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
     low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
     every_way = gives_every_wrench(W, np.full(count, True))
@@ -221,13 +205,6 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
             reach = np.maximum(each * low, each * high).sum(axis=1) / within[crossing]
             least = min(least, float(reach.min(initial=math.inf)))
     return least
-
-
-def _at_origin(q: Array) -> Array:
-    """Return the configuration with the base at the origin, so that world axes are base axes."""
-    at_origin = q.copy()
-    at_origin[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
-    return at_origin
 
 
 def _vector(values: Array) -> str:

@@ -1,7 +1,5 @@
 """Channel from command to actuator: sample and hold, delay, limits, wheels and thruster pulses."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,9 +16,6 @@ from fflin.kernel.tree import empty
 from fflin.robot.fields import Range, input_limits, pulsed_thrusters
 from fflin.robot.inputs import named_inputs
 from fflin.robot.robot import Robot
-
-# Fields of `Pulses` that change during a run.
-COUNTS = ("left", "level", "end")
 
 
 class Saturation(NamedTuple):
@@ -72,7 +67,8 @@ def saturation(
             f"has a least impulse of {item.least_impulse:g} N s, too large for a sample of "
             f"{time:g} s; give a longer sample="
             if time
-            else "is pulsed, which needs sampled commands; give sample=, or a sampled policy"
+            else "is pulsed, which needs sampled commands; give sample= (--sample), or a sampled "
+            "policy"
         )
         raise InputError(f"thruster '{name}' {why}")
     pulses = within.pulses._replace(
@@ -82,7 +78,6 @@ def saturation(
         least=least,
         quantum=np.where(on_off, most * dt, 1.0),
         time=time,
-        **{key: np.zeros(len(at)) for key in COUNTS},
     )
     return within._replace(pulses=pulses)
 
@@ -150,6 +145,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
     `initial` (nu,) acts until the first command arrives.
     """
     slots = delay // sample + 1 if sample else 1
+    fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
         low=limits.low,
         high=limits.high,
@@ -160,7 +156,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
         delay=np.array([float(delay)]),
         fresh=np.zeros(1),
         wheels=limits.wheels,
-        pulses=limits.pulses,
+        pulses=limits.pulses._replace(**fresh),
     )
     rules.limit(channel, channel.held)
     return channel
@@ -169,7 +165,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 class Channel:
     """Channel from the commands of `law` to the applied inputs, computed by the kernel's functions.
 
-    `law` and `speeds` are called with the arguments of `begin` or `ask`. `speeds` returns the
+    `law` and `speeds` are called with the arguments of `begin`. `speeds` returns the
     speeds (k,) of the wheels whose speed is limited.
     """
 
@@ -185,16 +181,8 @@ class Channel:
         self._law, self._speeds, self._u = law, speeds, initial.copy()
         self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
-        own = channel_of(limits, initial, sample, delay)
-        self._rules = own._replace(
-            wheels=own.wheels._replace(row=np.arange(self._wheels)),
-            pulses=own.pulses._replace(**{key: np.zeros(self._pulses) for key in COUNTS}),
-        )
-
-    @property
-    def continuous(self) -> bool:
-        """Whether the law is evaluated at every stage of the integrator."""
-        return not self._rules.sample
+        wheels = limits.wheels._replace(row=np.arange(self._wheels))
+        self._rules = channel_of(limits._replace(wheels=wheels), initial, sample, delay)
 
     @property
     def cuts(self) -> bool:
@@ -210,7 +198,3 @@ class Channel:
         speeds = self._speeds(*point) if self._wheels else self._u[:0]
         rules.transmit(self._rules, step, speeds, self._u)
         return self._u.copy()
-
-    def ask(self, *point: object) -> Array:
-        """Return the applied inputs for the present command of a law without a sample time."""
-        return self.begin(0, *point)

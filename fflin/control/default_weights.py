@@ -9,7 +9,8 @@ from scipy.linalg import eigh
 
 from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.base.errors import InputError, listed
-from fflin.base.validation import Array, Complex, Values
+from fflin.base.names import state_keys
+from fflin.base.validation import Array, Complex
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
@@ -59,7 +60,7 @@ class Weights(NamedTuple):
     R: Array
     rule: str
     bandwidth: float
-    terms: tuple[Array, Array]  # costs of the largest coordinates (m,) and inputs (nu,)
+    terms: Array  # costs of the largest states and inputs (nx + nu,)
 
 
 class Pace(NamedTuple):
@@ -183,7 +184,8 @@ def _of_inertia(
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
-    terms = h * on_positions.diagonal() * size**2, h * cost * use**2
+    largest = np.tile(on_positions.diagonal() * size**2, 2), cost * use**2
+    terms = h * np.concatenate(largest)
     return Weights(*costs(limit.bandwidth), rule, limit.bandwidth, terms)
 
 
@@ -214,8 +216,13 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     """Return the design displacement of each coordinate (m,), scaled by `fraction`."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
-    radius = _radius_of_gyration(lin.M) if names[:6] == _BASE else 1.0
-    size = np.empty(m)
+    M, radius, size = lin.M, 1.0, np.empty(m)
+    if names[:6] == state_keys(())[:6]:
+        # Radius of a spherical shell with the same mass and trace of the inertia.
+        mass = M[3, 3]
+        center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
+        moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
+        radius = math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
             size[i] = math.sin(math.radians(fraction * ROTATION / 2.0))
@@ -225,17 +232,6 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
             most = LENGTH if unit == "m" else ANGLE
             size[i] = fraction * min(most, TRAVEL * lin.limits.get(name, math.inf))
     return size
-
-
-_BASE = tuple(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz")
-
-
-def _radius_of_gyration(M: Array) -> float:
-    """Return the radius [m] of a spherical shell with the same mass and trace of the inertia."""
-    mass = M[3, 3]
-    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
-    moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
-    return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
 
 
 def _reach(S: Array, cost: Array, D: Array) -> Array:
@@ -323,17 +319,6 @@ def _growth(lin: LinearModel) -> Limit:
     return Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
 
 
-class _Trial(NamedTuple):
-    """Trial loop: its limit, its modes, and the inputs that it requires."""
-
-    limit: Limit
-    left: float  # bandwidth factor that the efforts allow
-    effort: str  # input that allows the smallest factor
-    rates: Values  # poles as rates (nx,) [1/s]
-    modes: Complex
-    required: Array  # largest inputs (nu,)
-
-
 def _slowed(
     lin: LinearModel,
     costs: Callable[[float], tuple[Array, Array]],
@@ -349,7 +334,8 @@ def _slowed(
     omits joints without a motor, because springs or gravity move them. The second result is a
     report of the achieved loop.
     """
-    trials = list[_Trial]()
+    # The limit that allows the smallest factor on the bandwidth, and the required inputs (nu,).
+    trials = list[tuple[Limit, Limit, str, Array]]()
     for _ in range(_TRIALS):
         Q, R = costs(limit.bandwidth)
         try:
@@ -365,38 +351,35 @@ def _slowed(
             _largest_use(K, size, lin.state_names),
             _largest_use(later, driven, lin.state_names).max(axis=0),
         )
-        left, what = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
-        trials.append(_Trial(limit, left, what, rates, modes, np.abs(lin.u0) + use))
-        if left >= 1.0 - 1e-6:
-            return limit, _achieved(lin, trials[-1])
+        left = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
+        decay, fast = -rates.real, np.abs(rates)
+        said = (
+            f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
+            f"1/s, damping ratio at least {(decay / fast).min():.2g}"
+        )
+        slow = decay < _AS_SLOW * math.sqrt(0.5) * limit.bandwidth
+        if names := _moving_most(lin, modes[:, slow]):
+            said += f"; modes decaying more slowly: {listed(names)}"
+        if left.bandwidth >= 1.0 - 1e-6:
+            return limit, said
+        trials.append((limit, left, said, np.abs(lin.u0) + use))
         if limit.bandwidth <= least.bandwidth:
             break
         # Springs and gravity require efforts even if the loop is very slow.
-        slower = Limit(min(max(left, 0.3), 0.8) * limit.bandwidth, what)
-        limit = max(slower, least)
+        slower = min(max(left.bandwidth, 0.3), 0.8) * limit.bandwidth
+        limit = max(left._replace(bandwidth=slower), least)
     if not trials:
         return limit, ""  # the design of the regulator fails and reports the reason
-    most = max(trial.left for trial in trials)
-    trial = next(x for x in trials if x.left >= _IN_VAIN * most)
-    limit, effort = trial.limit, trial.effort
+    most = max(left for _, left, *_ in trials).bandwidth
+    found = next(trial for trial in trials if trial[1].bandwidth >= _IN_VAIN * most)
+    limit, (_, effort), said, required = found
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
-    warn_beyond(lin.robot, where, units, trial.required[None], -high, high)
+    warn_beyond(lin.robot, where, units, required[None], -high, high)
     held = limit.what == least.what  # a slower loop cannot control the unstable mode
     what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    return limit._replace(what=what), _achieved(lin, trial)
-
-
-def _achieved(lin: LinearModel, trial: _Trial) -> str:
-    """Return a report of a loop's bandwidth and decay, and of modes that decay more slowly."""
-    decay, fast = -trial.rates.real, np.abs(trial.rates)
-    said = f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} 1/s, "
-    said += f"damping ratio at least {(decay / fast).min():.2g}"
-    slow = decay < _AS_SLOW * math.sqrt(0.5) * trial.limit.bandwidth
-    if names := _moving_most(lin, trial.modes[:, slow]):
-        said += f"; modes decaying more slowly: {listed(names)}"
-    return said
+    return limit._replace(what=what), said
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:

@@ -21,10 +21,9 @@ from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.fit import require_same
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 if TYPE_CHECKING:
-    import control
     import pinocchio as pin
 
     from fflin.linear.exchange import ToolGain
@@ -41,7 +40,19 @@ _FRAGILE = 0.3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Gain(Design):
+class ModelDesign(Design):
+    """Design for a linear model x' = A x + B u; the model is sampled if dt [s] is not 0."""
+
+    A: Array
+    B: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    robot: str
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gain(ModelDesign):
     r"""State-feedback gain ``u = u0 - K (x - x0)`` with its residual, poles and margins.
 
     Attributes
@@ -99,20 +110,14 @@ class Gain(Design):
     residual: float
     margin: float
     method: str
-    A: Array
-    B: Array
     Q: Array
     R: Array
     N: Array
     x0: Vector
     u0: Vector
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_units: tuple[str, ...]
     frame: str
-    robot: str
     weights: str
     regulated: tuple[str, ...]
     placement: Vector
@@ -129,12 +134,17 @@ class Gain(Design):
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
-        fold = partial(textwrap.fill, width=width())
+        left = [name for name in self.state_names if self.regulated and name not in self.regulated]
+        why = (
+            "(not reached by any input, or determined by other states; "
+            "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
+        )
         more = {
-            "not regulated": _unregulated(self),
+            "not regulated": f"{listed(left)} {why}" if left else "",
             "weights": self.weights,
             "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
         }
+        fold = partial(textwrap.fill, width=width())
         rates, margins = rates_of(self.poles, self.dt), self.margins
         result = (
             f"{len(self.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
@@ -160,7 +170,7 @@ class Gain(Design):
         """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
 
         Raises
@@ -192,8 +202,23 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
+        # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler,
+        # Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues
+        # of Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems
+        # and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)
-        return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
+        scale = np.sqrt(self.R.diagonal())
+        F, G, H = S @ self.closed_loop @ S.T, S @ self.B / scale, -scale[:, None] * self.K @ S.T
+        D = 0.5 * np.eye(len(H))
+        if self.dt:
+            # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
+            inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
+            D = D - H @ inverse @ G
+            F, G, H = inverse @ (F - unit), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
+        disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
+        most = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf
+        phase = math.degrees(2.0 * math.atan(disk / 2.0))
+        return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
 
 
 def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
@@ -223,18 +248,14 @@ def make_gain(
 ) -> Gain:
     """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
-    poles, margin = solution.ordered(lin.dt)
     return Gain._of(
+        solution,
         lin,
         K=solution.K @ S,
         P=S.T @ solution.P @ S,
         Q=S.T @ Q @ S,
         R=R,
         N=np.zeros(lin.B.shape) if N is None else S.T @ N,
-        poles=poles,
-        margin=margin,
-        residual=solution.residual,
-        method=solution.method,
         weights=weights,
         regulated=part.state_names,
         _lin=lin,
@@ -274,17 +295,6 @@ def one_sided(gain: Gain) -> str:
     )
 
 
-def _unregulated(gain: Gain) -> str:
-    """Return the states that are not fed back, with the reasons."""
-    left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
-    if not left:
-        return ""
-    return (
-        f"{listed(left)} (not reached by any input, or determined by other states; "
-        "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
-    )
-
-
 def _poles(gain: Gain) -> str:
     """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
     poles = gain.poles[gain.poles.imag >= 0.0]
@@ -321,24 +331,6 @@ class Margins(NamedTuple):
     disk: float
     gain: tuple[float, float]
     phase: float
-
-
-def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
-    """Return the margins at the inputs of a stable loop u = -K x, accurate to five digits."""
-    # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler, Packard
-    # and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues of
-    # Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems and
-    # Control Letters 14(4), 1990.
-    scale = np.sqrt(R.diagonal())
-    F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
-    if dt:
-        # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
-        inverse = np.linalg.inv(F + np.eye(len(F)))
-        D = D - H @ inverse @ G
-        F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
-    disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
-    gain = ((2.0 - disk) / (2.0 + disk), (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf)
-    return Margins(disk, gain, math.degrees(2.0 * math.atan(disk / 2.0)))
 
 
 def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:

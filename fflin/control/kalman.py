@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
@@ -15,24 +12,20 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.record import Design
-from fflin.base.validation import Array, Poles, Vector, dimension, instance, number
-from fflin.control.gain import Gain
+from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, number
+from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
 from fflin.control.tvlqr import FilterSchedule, asks_steady, require_continuous, steady_end
 from fflin.control.weights import Weight, columns, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
-from fflin.linear.linear_trajectory import LinearTrajectory, Steps, along, transitions
-from fflin.linear.model import LinearModel, state_space
-
-if TYPE_CHECKING:
-    import control
+from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Estimator(Design):
+class Estimator(ModelDesign):
     r"""Steady-state Kalman filter for the deviations of the state from the operating point.
 
     With u and y as deviations from u0 and y0, the estimate xh of x - x0 follows
@@ -84,8 +77,6 @@ class Estimator(Design):
     poles: Poles
     residual: float
     margin: float
-    A: Array
-    B: Array
     C: Array
     D: Array
     W: Array
@@ -93,14 +84,10 @@ class Estimator(Design):
     x0: Vector
     u0: Vector
     y0: Vector
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    robot: str
     estimated: tuple[str, ...]
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
         Raises
@@ -114,7 +101,7 @@ class Estimator(Design):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compensator(Design):
+class Compensator(ModelDesign):
     r"""Output-feedback compensator ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
 
     For a sampled model, ``A z + B (y - y0)`` is the value of z at the next sample. The state z is
@@ -144,19 +131,13 @@ class Compensator(Design):
     ((18, 18), True)
     """
 
-    A: Array
-    B: Array
     C: Array
     poles: Poles
     y0: Vector
     u0: Vector
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    robot: str
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
         Raises
@@ -255,15 +236,12 @@ def kalman(
     L = L_update = solution.K.T
     if lin.dt:
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
-    poles, margin = solution.ordered(lin.dt)
     return Estimator._of(
+        solution,
         whole,
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
         P=S.T @ solution.P @ S,
-        poles=poles,
-        residual=solution.residual,
-        margin=margin,
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,
@@ -420,8 +398,13 @@ def tvkalman(
         P = weight("P0", P0, traj.state_names)
     held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
     maps = np.array([whole for _, whole in held])
+    disturbed = np.zeros((len(held), nx, nx))  # covariance that is added during each sample
     with riccati.bounded_by("a smaller W or a larger V"):
-        disturbed = [_disturbed(steps, intensity) for steps, _ in held]
+        for covariance, (steps, _) in zip(disturbed, held, strict=True):
+            early, late = (np.array([intensity(t) for t in of]) for of in steps.nodes.T.tolist())
+            added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * early + LIGHT * late, steps.h)
+            for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
+                covariance[:] = step @ covariance @ step.T + each
         stages = [
             (block_diag(each, V), np.hstack((whole[:, :nx].T, C.T)))
             for each, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
@@ -434,24 +417,13 @@ def tvkalman(
         P=P,
         A=maps[:, :, :nx],
         B=maps[:, :, nx:],
-        W=np.array(disturbed),
+        W=disturbed,
         V=V,
         residual=residual,
         robot=traj.robot.name,
         dt=dt,
         verified=traj.verified,
     )
-
-
-def _disturbed(steps: Steps, intensity: Callable[[float], Array]) -> Array:
-    """Return the covariance (nx, nx) that a disturbance adds during a sample."""
-    nx = len(steps.maps[0])
-    first, second = (np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist())
-    added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * first + LIGHT * second, steps.h)
-    W = np.zeros((nx, nx))
-    for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
-        W = step @ W @ step.T + each
-    return W
 
 
 def disturbance(

@@ -6,16 +6,16 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, Mask, as_double, instance, number
+from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
@@ -126,15 +126,21 @@ class LinearController(Feedback):
             )
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
-        by = _fitted(_system_of(self.system), lin)
-        felt: Mask = np.logical_and(lin.D.any(axis=1), by.D.any(axis=0))
+        by = _system_of(self.system)
+        # Expand the system to all outputs and inputs of the model, with the sign applied.
+        columns = _indices("input", by.inputs, by.D.shape[1], "output", lin.output_names)
+        rows = _indices("output", by.outputs, len(by.D), "input", lin.input_names)
+        nz, (nu, ny) = len(by.A), lin.D.T.shape
+        B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
+        B[:, columns], C[rows], D[np.ix_(rows, columns)] = by.B, self.sign * by.C, self.sign * by.D
+        felt: Mask = np.logical_and(lin.D.any(axis=1), D.any(axis=0))
         if felt.any():
             raise InputError(
                 "the controller and the model form an algebraic loop through "
                 f"{listed(compress(lin.output_names, felt))}, because D of both is nonzero "
                 "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
-        dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
+        dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not nz) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt  # a sampled system with unknown sample time
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
@@ -142,7 +148,7 @@ class LinearController(Feedback):
                 f"model has dt = {lin.dt:g} s (0: continuous); give a controller with the dt of "
                 "the model, or give the continuous model"
             )
-        self.system = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
+        self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
         self.sign = 1.0  # `system` contains the sign from here on
 
     def __repr__(self) -> str:
@@ -268,15 +274,14 @@ class OutputFeedback(LinearController):
         compensator: Compensator,
         noise: Callable[[float], ArrayLike] | None = None,
     ) -> None:
-        instance("lin", lin, LinearModel, "a fflin.LinearModel")
         instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
+        super().__init__(compensator, lin, noise=noise)
+        self.compensator = compensator
         if not lin.dt:
             raise InputError(
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "
                 "estimator for it"
             )
-        super().__init__(compensator, lin, noise=noise)
-        self.compensator = compensator
 
 
 def _system_of(given: Any) -> System:
@@ -292,9 +297,16 @@ def _system_of(given: Any) -> System:
             )
         return _checked(*given)
     if not hasattr(given, "A") and (hasattr(given, "to_ss") or hasattr(given, "ninputs")):
-        given = _realised(given)
+        tool = type(given).__name__
+        try:
+            given = given.to_ss() if hasattr(given, "to_ss") else import_module("control").ss(given)
+        except Exception as error:  # each tool raises its own types
+            raise InputError(
+                f"the {tool} cannot be converted to a state space: {reason(error)}; a transfer "
+                "function must be proper, with no more zeros than poles"
+            ) from None
     if not all(hasattr(given, key) for key in "ABC"):
-        return _checked((), (), (), as_double("system", given))
+        return _checked(None, None, None, as_double("system", given))
     inputs, outputs = (
         getattr(given, f"{kind}_names", getattr(given, f"{kind}_labels", ()))
         for kind in ("input", "output")
@@ -305,27 +317,13 @@ def _system_of(given: Any) -> System:
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
-def _realised(given: object) -> Any:
-    try:
-        if hasattr(given, "to_ss"):
-            return given.to_ss()
-        import control
-
-        return control.ss(given)
-    except Exception as error:  # each tool raises its own types
-        raise InputError(
-            f"the {type(given).__name__} cannot be converted to a state space: {reason(error)}; a "
-            "transfer function must be proper, with no more zeros than poles"
-        ) from None
-
-
 def _checked(*given: Any) -> System:
     """Return a system with consistent sizes; if A is empty, the system consists of D alone."""
     *matrices, dt, inputs, outputs = System(*given)
-    matrices[3] = 0.0 if matrices[3] is None else matrices[3]
+    defaults = (), (), (), 0.0
     A, B, C, D = (
-        np.atleast_2d(as_double(f"controller's {key}", each))
-        for key, each in zip("ABCD", matrices, strict=True)
+        np.atleast_2d(as_double(f"controller's {key}", default if each is None else each))
+        for key, each, default in zip("ABCD", matrices, defaults, strict=True)
     )
     nz = len(A) if A.size else 0
     ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
@@ -359,28 +357,18 @@ def _read(path: Path) -> System:
             texts(found.get(f"{kind}_names", found.get(f"{kind.title()}Name", ())))
             for kind in ("input", "output")
         )
-    given = [key for key in "ABCD" if found.get(key) is not None]
-    if given != ["D"] and given[:3] != ["A", "B", "C"]:
+    A, B, C, D = (found.get(key) for key in "ABCD")
+    given = [each is not None for each in (A, B, C)]
+    if not all(given) and (any(given) or D is None):
         raise FileError(
             f"{path}: the file contains {listed(sorted(found)) or 'no arrays'}, expected A, B, C, "
             "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
-    A, B, C = (found[key] if key in given else () for key in "ABC")
     try:
-        return _checked(A, B, C, found.get("D"), dt, inputs, outputs)
+        return _checked(A, B, C, D, dt, inputs, outputs)
     except FflinError as error:
         raise type(error)(f"{path}: {error}") from None
-
-
-def _fitted(system: System, lin: LinearModel) -> System:
-    """Return a system expanded to all outputs and inputs of a model, matched by names."""
-    columns = _indices("input", system.inputs, system.D.shape[1], "output", lin.output_names)
-    rows = _indices("output", system.outputs, len(system.D), "input", lin.input_names)
-    nz, ny, nu = len(system.A), len(lin.output_names), len(lin.input_names)
-    B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
-    B[:, columns], C[rows], D[np.ix_(rows, columns)] = system.B, system.C, system.D
-    return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
 
 
 def _indices(

@@ -1,12 +1,9 @@
 """Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.analysis.controllability import require_stabilizable, require_weighed
 from fflin.analysis.reduction import regulated_part, selection
@@ -17,9 +14,9 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.validation import Array, dimension, instance
+from fflin.base.validation import Array, ArrayLike, dimension, instance
 from fflin.control.gain import Gain, make_gain
-from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve
+from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
 from fflin.control.weights import Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
 
@@ -246,8 +243,8 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
             "the solution overflows with these weights; give Qp, Qv and Ra with similar magnitudes"
         )
     R = L.T @ (ra[:, None] * L)
-    solution = Solution(P, K, poles, residual, "closed form")
-    return make_gain(whole, lin, solution, Q, 0.5 * R + 0.5 * R.T, None)
+    found = solved(P, K, poles, residual, "closed form")
+    return make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, None)
 
 
 def _diagonal(
@@ -274,8 +271,10 @@ def require_fixed_point(lin: LinearModel) -> None:
         for i in np.argsort(-np.abs(rate))
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]
-    advice = "linearise about a fixed point, with the q and u of fflin.equilibrium, or about "
-    advice += "a steady motion with moving=True"
+    advice = (
+        "linearise about a fixed point, with the q and u of fflin.equilibrium (--equilibrium, in "
+        "orbit --relative-equilibrium), or about a steady motion with moving=True"
+    )
     if lin.moving:
         advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
     raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")

@@ -9,12 +9,11 @@ from itertools import compress
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, Indices, Mask, instance, number, vector, whole
+from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, number, vector, whole
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
@@ -42,6 +41,9 @@ _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 # If the robot exceeds a limit by less than this fraction of the width between the limits, the
 # violation is not reported.
 _OVER = 1e-3
+
+# Violations of soft limits that the notes of a motion report.
+_OF_PLANS, _OF_ROBOT = "plans that exceed", "samples at which the robot exceeds"
 
 # _OPEN is DAQP's infinity, _SOFT is its code of a soft limit, and _SOFTENED is its exit flag for a
 # plan that exceeds a soft limit. _MOST is the largest number of iterations.
@@ -147,14 +149,7 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and dt="
         )
-    limited = _signals(source, limits)
-    if samples**2 * (len(limited.at) + len(lin.state_names)) * len(lin.input_names) > _MOST_ENTRIES:
-        raise InputError(
-            f"horizon is {samples} samples with {len(limited.at)} limits, which makes the "
-            "optimisation problem too large; give a shorter horizon or fewer limits"
-        )
-    of = source.robot if isinstance(source, LinearModel) else source.robot.name
-    ahead = Horizon((), samples, dt, lin.input_names, limited, of)
+    ahead = _unplanned(source, limits, samples, dt)
     if isinstance(source, LinearTrajectory):
         return _along(source, ahead, (Q, R, Qf, weights))
     return _about(source, ahead, (Q, R, Qf, weights))
@@ -165,11 +160,32 @@ class _Predictive:
     deviation: Callable[[Robot], Deviation]
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.horizon!r})"
+        by = self.horizon
+        said = f"{by.samples} samples of {by.dt:g} s, {len(by.limited)} limits"
+        return f"{type(self).__name__}('{by.robot}', {said})"
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot with the same states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
+
+    def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
+        """Return the quadratic program at the error e (nx,), by default zero, and time t [s].
+
+        About a point, e is the deviation x - x0, and the program does not depend on t.
+        """
+        of, stages = self.horizon, self.horizon.window(max(number("t", t), 0.0))
+        nx, size = len(stages[0].A), len(of.inputs) * of.samples
+        start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
+        states, z, limited = condensed(stages, planned=False)
+        (low, high, soft), free = of.bounds(stages), limited[:, size:] @ start
+        double = 2.0 * z[:, :size].T
+        H, g = double @ z[:, :size], double @ (z[:, size:] @ start)
+        names = (
+            tuple(f"{name}[{k}]" for k in range(of.samples) for name in names)
+            for names in (of.inputs, of.limited)
+        )
+        program = (H, g, limited[:, :size], low - free, high - free, soft)
+        return Matrices(*program, states[..., size:], states[..., :size], *names)
 
 
 @dataclass(eq=False, repr=False)
@@ -190,10 +206,6 @@ class Mpc(_Predictive, Feedback):
     gain: Gain
     horizon: Horizon
 
-    def matrices(self, e: ArrayLike | None = None) -> Matrices:
-        """Return the quadratic program at the deviation e = x - x0 (nx,), by default zero."""
-        return self.horizon.matrices(e, 0.0)
-
 
 @dataclass(eq=False, repr=False)
 class TrajectoryMpc(_Predictive, TrajectoryFeedback):
@@ -204,13 +216,11 @@ class TrajectoryMpc(_Predictive, TrajectoryFeedback):
 
     horizon: Horizon
 
-    def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
-        """Return the quadratic program at time t [s] and error e (nx,), by default zero."""
-        return self.horizon.matrices(e, t)
 
-
-def _signals(of: LinearModel | LinearTrajectory, limits: object) -> Signals:
-    """Return the limits of a model's inputs, states and outputs."""
+def _unplanned(
+    of: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
+) -> Horizon:
+    """Return a horizon without stages, with the limits of a model's inputs, states and outputs."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
@@ -235,76 +245,56 @@ def _signals(of: LinearModel | LinearTrajectory, limits: object) -> Signals:
             f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
         )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
-    return Signals(tuple(names[i] for i in at), at, low[at], high[at])
+    if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
+        raise InputError(
+            f"horizon is {samples} samples with {len(at)} limits, which makes the optimisation "
+            "problem too large; give a shorter horizon or fewer limits"
+        )
+    limited = tuple(names[i] for i in at)
+    return Horizon((), samples, dt, inputs, robot.name, limited, at, low[at], high[at])
 
 
 def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
     """Return the controller about a point, with the stages of the horizon `ahead`."""
-    (Q, R, Qf, weights), sampled, signals = cost, lin.discretize(ahead.dt), ahead.signals
+    (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
-    limited = signals.of_stage(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
-    far = np.maximum(limited[2], -limited[3]) > 1e-9
-    if far.any():
-        raise InputError(
-            f"the point exceeds the limits of {listed(compress(signals.names, far))}; give wider "
-            "limits, or linearise about another point"
-        )
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
     whole = np.hstack((sampled.A, sampled.B))
     with bounded_by("a smaller Qf"):
         K, P, _ = samples_back([(total, whole)] * ahead.samples, end)
-    stages = [_stage(total, whole, *each, limited) for each in zip(K, P[:-1], strict=True)]
+    stages = [ahead.stage(total, whole, *by, lin, lin.u0, lin.x0) for by in zip(K, P, strict=False)]
+    far = np.maximum(stages[0].low, -stages[0].high) > 1e-9
+    if far.any():
+        raise InputError(
+            f"the point exceeds the limits of {listed(compress(ahead.limited, far))}; give wider "
+            "limits, or linearise about another point"
+        )
     return Mpc(sampled, gain, replace(ahead, stages=tuple(stages[::-1])))
 
 
 def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     """Return the controller along a trajectory, with the stages of the horizon `ahead`."""
-    (Q, R, Qf, weights), dt, of_stage = cost, ahead.dt, ahead.signals.of_stage
+    (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
-    models, end = along(traj.resampled(dt)), follows.end
-
-    def about(of: LinearModel, u: Array) -> tuple[Array, ...]:
-        # Limits on the base pose apply to its error relative to the trajectory.
-        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
-        return of_stage(of.C, of.D, u, x, of.y0)
-
-    stages = []
-    for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R)):
-        limited = about(models[k + 1], follows.commanded(k * dt)[2])
-        stages.append(_stage(*sample, schedule.K[k], schedule.P[k + 1], limited))
+    models, end, stages = along(traj.resampled(dt)), follows.end, list[Stage]()
     held, sampled = sampled_cost(end, dt, schedule.Q, schedule.R), end.discretize(dt)
     P, K = steady_regulator(end, schedule.Q, schedule.R, dt)
     total = np.block([[held.Q, held.N], [held.N.T, held.R]])
-    last = _stage(total, np.hstack((sampled.A, sampled.B)), K, P, about(end, end.u0))
-    stages += [last] * ahead.samples
+    last = total, np.hstack((sampled.A, sampled.B)), K, P, end, end.u0
+    designs = [
+        (*sample, schedule.K[k], schedule.P[k + 1], models[k + 1], follows.commanded(k * dt)[2])
+        for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
+    ]
+    for total, step, K, P, of, u in (*designs, last):
+        # Limits on the base pose apply to its error relative to the trajectory.
+        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
+        stages.append(ahead.stage(total, step, K, P, of, u, x))
+    stages += stages[-1:] * (ahead.samples - 1)
     return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))
-
-
-def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array, ...]) -> Stage:
-    """Return the stage of a sample from its cost, transition, gain, and the next sample's P."""
-    A, B = np.split(whole, [len(P)], axis=1)
-    L = np.linalg.inv(np.linalg.cholesky(total[len(P) :, len(P) :] + B.T @ P @ B)).T
-    return Stage(A, B, K, L, *limited)
-
-
-class Signals(NamedTuple):
-    """Limited signals: their names, limits, and indices among inputs, states and outputs."""
-
-    names: tuple[str, ...]
-    at: Indices
-    low: Array
-    high: Array
-
-    def of_stage(self, C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
-        """Return E, D, low and high of a stage from its output matrices and target values."""
-        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)[self.at]
-        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[self.at]
-        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[self.at]
-        return of_e, of_d, self.low - there, self.high - there
 
 
 class Stage(NamedTuple):
@@ -378,22 +368,30 @@ class Horizon:
     samples: int  # N
     dt: float
     inputs: tuple[str, ...]
-    signals: Signals
     robot: str
-
-    @property
-    def limited(self) -> tuple[str, ...]:
-        """Names of the limited signals."""
-        return self.signals.names
+    limited: tuple[str, ...]  # names of the limited signals
+    at: Indices  # indices of the limited signals among inputs, states and outputs
+    low: Array
+    high: Array
 
     @property
     def acting(self) -> Indices:
         """Indices of the inputs that have limits."""
-        return self.signals.at[self.signals.at < len(self.inputs)]
+        return self.at[self.at < len(self.inputs)]
 
-    def __repr__(self) -> str:
-        said = f"{self.samples} samples of {self.dt:g} s, {len(self.limited)} limits"
-        return f"'{self.robot}', {said}"
+    def stage(
+        self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
+    ) -> Stage:
+        """Return the stage of a sample from its cost, transition, gain, and the next sample's P.
+
+        At the end of the sample, the target is the state `x` and the output of the model `of`.
+        """
+        (nx, nu), there = of.B.shape, np.concatenate((u, x, of.y0))[self.at]
+        A, B = np.split(whole, [nx], axis=1)
+        L = np.linalg.inv(np.linalg.cholesky(total[nx:, nx:] + B.T @ P @ B)).T
+        E = np.vstack((np.zeros((nu, nx)), np.eye(nx), of.C))[self.at]
+        D = np.vstack((np.eye(nu), np.zeros((nx, nu)), of.D))[self.at]
+        return Stage(A, B, K, L, E, D, self.low - there, self.high - there)
 
     def window(self, t: float) -> tuple[Stage, ...]:
         """Return the N samples from time t on."""
@@ -406,22 +404,6 @@ class Horizon:
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
 
-    def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
-        """Return the quadratic program at time t [s] for the deviation e (nx,) of the state."""
-        stages = self.window(max(number("t", t), 0.0))
-        nx, size = len(stages[0].A), len(self.inputs) * self.samples
-        start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
-        states, z, limited = condensed(stages, planned=False)
-        (low, high, soft), free = self.bounds(stages), limited[:, size:] @ start
-        double = 2.0 * z[:, :size].T
-        H, g = double @ z[:, :size], double @ (z[:, size:] @ start)
-        names = (
-            tuple(f"{name}[{k}]" for k in range(self.samples) for name in of)
-            for of in (self.inputs, self.limited)
-        )
-        program = (H, g, limited[:, :size], low - free, high - free, soft)
-        return Matrices(*program, states[..., size:], states[..., :size], *names)
-
 
 class Receding:
     """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
@@ -429,8 +411,9 @@ class Receding:
     def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
-        self.solves = self.softened = self.unfinished = self.exceeded = 0
-        self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
+        self.solves = self.unfinished = 0
+        # Violations of soft limits: their number, and the largest one with its description.
+        self._violations = dict.fromkeys((_OF_PLANS, _OF_ROBOT), (0, 0.0, ""))
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
         if horizon.limited:  # now, so that the first sample is not slower
             self._change(horizon.window(0.0))
@@ -442,11 +425,8 @@ class Receding:
             f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
             f"{self.solves}"
         )
-        if self.softened:
-            said += f"; plans that exceed a soft limit: {self.softened} (worst: {self._said})"
-        if self.exceeded:
-            said += f"; samples at which the robot exceeds a soft limit: {self.exceeded}"
-            said += f" (worst: {self._met})"
+        for what, (count, _, worst) in self._violations.items():
+            said += f"; {what} a soft limit: {count} (worst: {worst})" if count else ""
         if self.unfinished:
             said += (
                 "; plans without a solution, replaced by the saturated LQR command: "
@@ -472,7 +452,12 @@ class Receding:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
-        self._judge(t, e)
+        if self._due:  # the robot may exceed soft limits because it differs from the model
+            by, last = self._due
+            reached, width = by.E @ e + by.D @ last, by.high - by.low
+            excess = np.maximum(by.low - reached, reached - by.high)
+            width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
+            self._record(_OF_ROBOT, t - self.of.dt, excess, 1.0 / width, _OVER)
         z, flag = self._solved(free)
         if flag <= 0:  # solve again without a warm start
             self._start()
@@ -480,7 +465,9 @@ class Receding:
         if flag > 0:
             d += now.L @ z[: len(d)]
         if flag == _SOFTENED:
-            self._count(t, free + self._G @ z)
+            reached = free + self._G @ z
+            excess = np.maximum(self._low - reached, reached - self._high)
+            self._record(_OF_PLANS, t, excess, self._unit, _VIOLATED * self._size)
         if flag <= 0:
             self.unfinished += 1
             if self.unfinished == 1:
@@ -495,30 +482,18 @@ class Receding:
         self._due = now, d
         return d
 
-    def _judge(self, t: float, e: Array) -> None:
-        """Record soft limits that the robot exceeds because it differs from the model."""
-        first = len(self.of.acting)
-        if self._due is None or first == len(self.of.limited):
-            return
-        by, d = self._due
-        reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
-        excess = np.maximum(low - reached, reached - high)
-        fractions = excess / np.where(np.isfinite(high - low), high - low, 1.0)
-        at = int(fractions.argmax())
-        self.exceeded += bool(fractions[at] > _OVER)
-        if fractions[at] > self._over:
-            self._over = float(fractions[at])
-            self._met = f"{self.of.limited[first + at]} by {excess[at]:.2g} at {t:.4g} s"
+    def _record(self, what: str, t: float, excess: Array, unit: Array, least: float) -> None:
+        """Record by how much soft limits are exceeded in samples from time t [s] on.
 
-    def _count(self, t: float, reached: Array) -> None:
-        """Record by how much a plan exceeds the soft limits."""
-        excess = np.maximum(self._low - reached, reached - self._high) * self._soft
-        row = int((fractions := excess * self._unit).argmax())
-        self.softened += bool(fractions[row] > _VIOLATED * self._size)
-        if fractions[row] > max(self._worst, _VIOLATED * self._size):
+        An excess counts if it is above `least` after multiplication by `unit`.
+        """
+        fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
+        row, (count, most, said) = int(fractions.argmax()), self._violations[what]
+        if fractions[row] > max(most, least):
             sample, at = divmod(row, len(self.of.limited))
-            self._worst, when = float(fractions[row]), t + (sample + 1) * self.of.dt
-            self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+            most, when = float(fractions[row]), t + (sample + 1) * self.of.dt
+            said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+        self._violations[what] = count + bool(fractions[row] > least), most, said
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         fresh, self._stages = not self._stages, stages

@@ -1,7 +1,5 @@
 """Trajectory planning: low-effort motions between two states within limits."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -9,13 +7,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, Mask, number, whole
-from fflin.control.optimal.plan_search import Search, cost_of_inputs, excess
+from fflin.base.validation import Array, ArrayLike, Mask, number, whole
+from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
@@ -160,22 +157,23 @@ def plan(
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
-    size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
-    size[size == 0.0] = 1.0
     _require_within(shooting, bounds, "start", start, np.full(state.nx, True))
     _require_within(shooting, bounds, "goal", end, asked)
     # A search without a solution may diverge; an error is then raised instead of NumPy warnings.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
-        guess = shooting.guess(start, end)
-        cost = cost_of_inputs(shooting, weights, guess[2])
-        inputs = np.array((low, high))
-        search = Search(shooting, start, end, asked, bounds, inputs, cost, _PARTS, line.say)
-        made = _least(search, guess, size)
+        # Weights of the knots in the integral: hold times, or the trapezoidal rule.
+        h, inputs = shooting.h, np.array((low, high))
+        held = np.append(h, h[-1] if shooting.held else 0.0)
+        held = held if shooting.held else 0.5 * (held + held[::-1])
+        cost = held[:, None] * weights
+        size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
+        search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
+        made = _least(search)
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
             q[-1], v[-1] = end  # without the rounding errors of the motion
-        note = _note(shooting, made, size)
+        note = _note(shooting, made)
         if made.most > _BETWEEN:
             warnings.warn(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
@@ -193,8 +191,8 @@ class _Made(NamedTuple):
     u: Array
     missed: Array  # error at the goal (nx,)
     at_knots: Array  # largest limit violations at the knots (nx,)
-    beyond: Array  # limit violations at the ends of all parts (N, parts, nx)
-    most: float  # largest entry of `beyond` as a fraction of the limit
+    beyond: Array  # limit violations at the ends of all parts (N, parts, nx), relative to limits
+    most: float  # largest entry of `beyond`
 
     @property
     def reached(self) -> bool:
@@ -202,20 +200,23 @@ class _Made(NamedTuple):
         return max(self.missed.max(), self.at_knots.max()) <= _REACHED
 
 
-def _least(search: Search, guess: tuple[Array, Array, Array], size: Array) -> _Made:
+def _least(search: Search) -> _Made:
     """Return the plan of least effort, or the plan that is closest to the goal and the limits."""
-    shooting, bounds, best = search.shooting, search.bounds, None
+    shooting, bounds, cost, best = search.shooting, search.bounds, search.cost, None
+    guess = shooting.guess(search.start, search.end)
+    cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # the guess costs 1
     # If the limits cannot be met between knots, the search is repeated with limits at the knots
     # only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
-        q, v, u = search._replace(parts=parts).best(*guess)
+        q, v, u = search._replace(cost=cost, parts=parts).best(*guess)
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
         every = max(1, shooting.steps // _PARTS)
         fine = shooting.motions(q, v, u, every * _PARTS)
         points = (each[:, every::every] for each in fine[:2])
         beyond = excess(bounds[:, None, None] - shooting.limited_values(*points))
+        beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        made = _Made(q, v, u, missed, at_knots, beyond, float((beyond / size).max()))
+        made = _Made(q, v, u, missed, at_knots, beyond, float(beyond.max()))
         if best is None or (made.reached, -made.most) > (best.reached, -best.most):
             best = made
         if best.reached and best.most <= _BETWEEN:
@@ -266,11 +267,11 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     )
 
 
-def _note(shooting: Shooting, made: _Made, size: Array) -> str:
+def _note(shooting: Shooting, made: _Made) -> str:
     """Describe the largest violation of a state limit (nx,) by the integrated motion."""
     most = "exceeds no state limit"
     if made.most > 0.0:
-        k, part, i = np.unravel_index((made.beyond / size).argmax(), made.beyond.shape)
+        k, part, i = np.unravel_index(made.beyond.argmax(), made.beyond.shape)
         at = (k + (part + 1) / _PARTS) * shooting.h[0]
         percent = f"{100.0 * made.most:.2g} %"
         most = f"exceeds the limit of {shooting.state.names[i]} by {percent} at t = {at:.4g} s"

@@ -1,27 +1,21 @@
 """Figures of linear models and control loops: matrices, modes, checks, poles and margins."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.analysis.modes import Modes
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
+from fflin.base.figures import COLORS, Axes, Figure, cycle, drawing, letters_of, logarithmic
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import Array, Mask, Values, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _LINE = "#888888"
 
@@ -73,24 +67,22 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         top = float(entries.max(initial=0.0)) or 1.0
         norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
         signals = (
-            (lin.state_names, lin.state_names, lin.state_units),
-            (lin.input_names, input_keys(lin), lin.input_units),
+            ("A", lin.state_names, lin.state_names, lin.state_units),
+            ("B", lin.input_names, input_keys(lin), lin.input_units),
         )
         letters = letters_of(1, 72.0 * cell)
-        groups = [first for first, *_ in runs(lin.state_names, lin.state_units)[1:]]
-        for ax, sizes, (names, keys, units) in zip(axes, drawn, signals, strict=True):
+        for ax, sizes, (title, names, keys, units) in zip(axes, drawn, signals, strict=True):
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
+            ax.set_title(f"{title} ({nx} x {len(names)})")
             ax.set_xticks(range(len(names)), names, fontsize=letters, rotation=90)
+            ax.set_yticks([])
             for first, *_ in runs(keys, units)[1:]:
                 ax.axvline(first - 0.5, color="#888888", lw=0.6)
-            for first in groups:
+            for first, *_ in runs(lin.state_names, lin.state_units)[1:]:
                 ax.axhline(first - 0.5, color="#888888", lw=0.6)
         axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
-        axes[1].set_yticks([])
-        axes[0].set_title(f"A ({nx} x {nx})")
-        axes[1].set_title(f"B ({nx} x {nu})")
         of = "row" if lin.dt else "row's rate"
         figure.colorbar(image, ax=axes, shrink=0.8).set_label(
             f"magnitude, in SI units of the {of} per unit of the column"

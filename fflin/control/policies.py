@@ -6,11 +6,10 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
-from fflin.base.validation import Array, frozen, instance, shaped, vector
+from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import readout

@@ -1,7 +1,5 @@
 """Trajectory tracking: feedback of the state or of the outputs along a trajectory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -9,11 +7,10 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider

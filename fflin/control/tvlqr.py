@@ -13,11 +13,10 @@ from scipy.linalg import block_diag
 from fflin.analysis.reduction import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
-from fflin.base.record import Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
@@ -34,12 +33,12 @@ from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Schedule(Design):
+class Schedule(ModelDesign):
     """Gain as a function of time, given at the knots or samples of a trajectory."""
 
     t: Vector
     P: Array
-    dt: float
+    residual: float
 
     @cached_property
     def starts(self) -> list[float]:
@@ -102,15 +101,9 @@ class GainSchedule(Schedule):
     """
 
     K: Array
-    A: Array
-    B: Array
     Q: Array
     R: Array
     Qf: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    robot: str
     weights: str
     knots: Vector
     q: Array
@@ -231,18 +224,12 @@ class FilterSchedule(Schedule):
     """
 
     L: Array
-    A: Array
-    B: Array
     C: Array
     D: Array
     y: Array
     W: Array
     V: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    robot: str
 
     def gain(self, t: float) -> Array:
         """Return L (nx, ny) of the most recent sample at time t."""

@@ -23,7 +23,10 @@ from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
-Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
+Weight: TypeAlias = ArrayLike | Mapping[str, float]
+
+# A weight from the user, its name or pattern, and whether it is a largest value (Bryson).
+_Given: TypeAlias = tuple[float, str, bool]
 
 # A relative asymmetry or a negative eigenvalue is rounding error if its magnitude is below this.
 _ROUNDING = 1e-9
@@ -232,12 +235,10 @@ def sampled_cost(
         )
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
-    nx, nu = lin.B.shape
-    F, W = np.zeros((2, nx + nu, nx + nu))
-    W[:nx, :nx], W[nx:, nx:] = Q, R
-    F[:nx, :nx], F[:nx, nx:] = lin.A, lin.B
-    if cross is not None:
-        W[:nx, nx:], W[nx:, :nx] = cross, cross.T
+    nx, cross = len(Q), np.zeros(lin.B.shape) if cross is None else cross
+    W = np.block([[Q, cross], [cross.T, R]])
+    F = np.zeros_like(W)
+    F[:nx] = np.hstack((lin.A, lin.B))
     total = held_cost(F, W, h)
     if not np.isfinite(total).all():
         raise InputError(f"dt is {h:g} s, within which the model overflows; give a shorter dt")
@@ -285,8 +286,16 @@ def rule_weights(
     weights = dict[int, _Given]()
     for layer, of_robot in layers:
         weights |= _weights_of(lin, layer, of_robot)
-    if named := dict.fromkeys(each.key for each in weights.values()):
-        Q, R = _reweighed(Q, R, terms, weights)
+    if weights:
+        # A common factor of Q and R does not change the gain. The rule's weights are scaled so that
+        # the largest values of the named states and inputs cost 1, as in Bryson's rule.
+        costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
+        scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+        Q, R = scale * Q, scale * R
+        for index, (value, *_) in weights.items():
+            matrix, at = (Q, index) if index < len(Q) else (R, index - len(Q))
+            matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
+        named = dict.fromkeys(key for _, key, _ in weights.values())
         rule = f"{', '.join(named)} as given; all other weights: {rule}"
         rule += " (these figures are for this rule alone)" if terms.any() else ""
     if source.dt == lin.dt:
@@ -303,18 +312,15 @@ def _of_regulated(
     are 0 if the rule has no largest values.
     """
     part = regulated_part(lin, wheel_speeds)
-    if part is lin:
-        Q, R, rule, _, (of_positions, of_inputs) = default_weights(lin, pace)
-        return Q, R, rule, np.concatenate((np.tile(of_positions, 2), of_inputs))
     wheels, _ = ignorable_wheels(lin)
-    body = regulated_part(without(lin, wheels))
+    body = lin if part is lin else regulated_part(without(lin, wheels))
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
     # A wheel that is already at its limit is treated as a wheel at rest, and the report names it.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
-    found = default_weights(body, pace, dict(zip(names, room, strict=True)))
-    Q, R, rule, bandwidth, (of_positions, of_inputs) = found
+    momenta = dict(zip(names, room, strict=True))
+    Q, R, rule, bandwidth, terms = default_weights(body, pace, momenta)
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
         rule += (
             "; wheel speeds already at or beyond the URDF limit at the operating point: "
@@ -322,7 +328,7 @@ def _of_regulated(
         )
     S = selection(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
-    terms = np.concatenate((np.tile(of_positions, 2) @ S, of_inputs))
+    terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
         # Z spans the null space of the scaled forces. For any vector n, the inputs R^-1/2 Z n
@@ -332,14 +338,6 @@ def _of_regulated(
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
         rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
     return Q, R, rule, terms
-
-
-class _Given(NamedTuple):
-    """A weight from the user, its name or pattern, and whether it is a largest value (Bryson)."""
-
-    value: float
-    key: str
-    largest: bool
 
 
 def _weights_of(
@@ -357,7 +355,7 @@ def _weights_of(
             value = number(f"{part} of '{key}'", raw)
             if part == "bryson":
                 value = inverse_square(f"largest value of '{key}' (--bryson)", value)
-            values[key] = _Given(value, key, part == "bryson")
+            values[key] = value, key, part == "bryson"
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}
         if both := found.keys() & at.keys():
@@ -367,20 +365,3 @@ def _weights_of(
             )
         found |= at
     return found
-
-
-def _reweighed(
-    Q: Array, R: Array, terms: Array, given: Mapping[int, _Given]
-) -> tuple[Array, Array]:
-    """Return Q and R with the `given` weights, and all others scaled to match them.
-
-    A common factor of Q and R does not change the gain. The rule's weights are scaled so that the
-    largest values of the named states and inputs cost 1, as in Bryson's rule.
-    """
-    costs = [terms[index] for index, each in given.items() if each.largest and terms[index]]
-    scale = math.exp(-np.log(costs).mean()) if costs else 1.0
-    Q, R, nx = scale * Q, scale * R, len(Q)
-    for index, (value, *_) in given.items():
-        matrix, at = (Q, index) if index < nx else (R, index - nx)
-        matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
-    return Q, R

@@ -1,7 +1,5 @@
 """Impacts: instant changes of a robot, such as a jammed joint, and the velocities just after."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,23 +1,18 @@
 """Configurations, velocities and inputs, built from values by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, rates_by_name
-from fflin.base.validation import Array, instance, numbers, placement
+from fflin.base.validation import Array, ArrayLike, instance, numbers, placement
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from copy import copy
 from itertools import compress
 from operator import attrgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -13,15 +12,12 @@ import pinocchio as pin
 import fflin.robot.inputs as kinds
 from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
-from fflin.base.validation import Array, Indices, instance, placement, vector
+from fflin.base.validation import Array, ArrayLike, Indices, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
 from fflin.dynamics.orbital import field_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 
 class StateMap:
@@ -382,7 +378,7 @@ class Actuation:
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
-        self._state, self._model = state, robot.model
+        self.state, self._model = state, robot.model
         names: list[str] = []
         units: list[str] = []
         groups: list[str] = []
@@ -451,7 +447,7 @@ class Actuation:
             pin.getJointJacobian(self._model, data, joint, pin.ReferenceFrame.LOCAL).T.dot(wrenches)
             for joint, _, wrenches in self.wrench_columns
         ]
-        columns[:, self._of_carried] = self._state.forces(np.concatenate(forces, axis=1))
+        columns[:, self._of_carried] = self.state.forces(np.concatenate(forces, axis=1))
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:

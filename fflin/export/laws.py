@@ -1,7 +1,5 @@
 """Control laws as the tables that the C code contains, with test cases computed by fflin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

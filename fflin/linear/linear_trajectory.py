@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array
+from fflin.base.validation import Array, ArrayLike
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
+from fflin.linear.fit import require_same
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel, refuse_sampled
 from fflin.linear.trajectory import Trajectory, intervals_of
@@ -77,11 +77,8 @@ class LinearTrajectory(Trajectory):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.state_names != self._aba.state.names:
-            raise InputError(
-                f"the linear trajectory does not fit the given robot '{self.robot.name}': its "
-                "states differ; give the robot for which the trajectory was made"
-            )
+        made, there = "the linear trajectory was made for another robot", self._aba.state.names
+        require_same(made, self.robot, "state", (self.state_names,) * 2, (there,) * 2)
 
     @property
     def input_units(self) -> tuple[str, ...]:

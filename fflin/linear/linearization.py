@@ -123,9 +123,8 @@ class Prepared:
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
-        chart, r_b = _STANDING, _STANDING.q_b
-        if not self.own_reference:
-            chart, r_b = state.chart(q), state.positions(q)
+        chart = _STANDING if self.own_reference else state.chart(q)
+        r_b = chart.q_b if self.own_reference else state.positions(q)
         return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
 
     @property
@@ -134,6 +133,8 @@ class Prepared:
         from fflin.kernel.tree import batch_tree
 
         name = self.robot.name
+        if self.sensing is not None:
+            return "the outputs are not the state"
         if not numba_is_there():
             return "numba is not installed (pip install 'fflin[fast]')"
         if self.robot.orbit:
@@ -141,14 +142,10 @@ class Prepared:
         return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; raise `InputError` if they are not available."""
+        """Return the compiled accelerations, unless the robot is `not_compilable`."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
-        if reason := self.not_compilable:
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
         tree = batch_tree(self.robot)
         assert tree is not None
         return RowAccelerations(self.map, self.actuation, tree)
@@ -306,20 +303,19 @@ class Linearizer:
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
-        chart, r_b = _STANDING, _STANDING.q_b
-        if not ready.own_reference:
-            chart, r_b = state.chart(q), state.positions(q)
+        chart = _STANDING if ready.own_reference else state.chart(q)
         nu = state.velocities(v)
         u_base = actuation.in_base_axes(chart, u)
         A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
         rates = self._accelerations.rates(q, v, nu, u_base, A[lower], B[lower])
         seen: dict[str, Array] = {}
         if ready.sensing is not None:
+            r_b = chart.q_b if ready.own_reference else state.positions(q)
             x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
             point = q, v, nu, u_base
             seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
             _require_finite(*seen.values())
-        rate = assemble(state, actuation, chart, nu, u_base, rates, A, moving=ready.moving)
+        rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         _require_finite(A, B, rate)
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
@@ -346,7 +342,7 @@ class Linearizer:
                     here = _STANDING, rates, x0[k], point
                     seen.append(output_equations(sensing, actuation, self._data, *here))
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
-        f0 = assemble(state, actuation, chart, nu, u, all_rates, A, moving=ready.moving)
+        f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0

@@ -7,23 +7,24 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Result, Vector, frozen, number, positive
+from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
     import control
     import pinocchio as pin
-    from numpy.typing import ArrayLike
     from scipy import signal
 
     from fflin import ToolModel
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
+
+ControlSystem: TypeAlias = "control.StateSpace"
 
 
 @dataclass(frozen=True)
@@ -365,7 +366,7 @@ class LinearModel(StateSpace):
         matrices = (self.A, self.B, self.C, self.D)
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return the model of the deviations from x0 and u0 as a `control.StateSpace`.
 
         The `StateSpace` has the signal names of the model. The constant f0 is omitted.
@@ -421,9 +422,7 @@ class LinearModel(StateSpace):
         return replace(lin, _source=(lin.fingerprint, lin))
 
 
-def state_space(
-    matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]
-) -> control.StateSpace:
+def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
     """Return a `control.StateSpace` of A, B, C, D and names of states, inputs and outputs."""
     control = optional_package("control", "to_control needs python-control", "control")
     # python-control reserves dots in signal names for its own system.signal syntax.

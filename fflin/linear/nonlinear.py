@@ -1,7 +1,5 @@
 """Nonlinear model in the chart of a linear model, and its derivatives by differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

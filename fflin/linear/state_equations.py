@@ -3,8 +3,6 @@
 Equation numbers refer to docs/derivation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +17,6 @@ from fflin.dynamics.state import Actuation, StateMap
 
 
 def assemble(
-    state: StateMap,
     actuation: Actuation,
     chart: Chart,
     nu: Array,
@@ -35,6 +32,7 @@ def assemble(
     a view of the lower half of A, and `rates.by_u` a view of the lower half of B. Both are
     converted in place from base axes to the chart and the frame.
     """
+    state = actuation.state
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
@@ -42,7 +40,7 @@ def assemble(
     position_rate = chart.turned(v[..., None])[..., 0]
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)  # (4.8)
 
-    theta = _over_rotations(state, actuation, chart, u, rates, W)
+    theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
     # Rows of attitude and position. At the reference, the other blocks are as at rest.
@@ -88,14 +86,10 @@ def assemble(
 
 
 def _over_rotations(
-    state: StateMap,
-    actuation: Actuation,
-    chart: Chart,
-    u: Array,
-    rates: AccelerationDerivatives,
-    W: Array,
+    actuation: Actuation, chart: Chart, u: Array, rates: AccelerationDerivatives, W: Array
 ) -> Array:
     """Return the derivatives (.., 6 + n, 3) of the accelerations over base rotations (4.4)."""
+    state = actuation.state
     omega_in_reference, v_in_reference = state.axes
     # `by_turn` is the derivative in base axes, and is converted in place. It is zero without an
     # orbit, and so also if omega is in reference axes.

@@ -1,9 +1,7 @@
 """Conventions of other tools for a free flyer (`TOOLS`), and derivatives of their coordinates."""
 
-from __future__ import annotations
-
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -11,14 +9,11 @@ import pinocchio as pin
 import fflin.base.rotation as turning
 from fflin.base.errors import ChartError, InputError, unknown
 from fflin.base.rotation import quaternion_product, skew
-from fflin.base.validation import NORM_TOLERANCE, Array, placement, vector
+from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, placement, vector
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 # Complex step along a motion. Rounding removes its square from every sum, so derivatives are exact
 # to machine precision.

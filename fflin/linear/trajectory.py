@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
-from fflin.base.validation import as_double, frozen, instance, number, vector
+from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
@@ -355,9 +354,7 @@ class Trajectory(Design):
         flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
         digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
-        digits[:3] = _POSITION_ROUNDING * max(
-            float(np.abs(x).max()) for x in (q[:, :3], flown, velocities)
-        )
+        digits[:3] = _POSITION_ROUNDING * np.abs((q[:, :3], flown, velocities)).max()
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
@@ -394,19 +391,17 @@ class Trajectory(Design):
                 found.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
         return np.where(np.isfinite(found), found, np.inf)
 
-    def end(
-        self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
-    ) -> tuple[Array, Array]:
-        """Integrate by CF4 (11.1) over part of an interval, by default all of it; return q, v."""
+    def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
+        """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
         start, h = self.t[k], self.t[k + 1] - self.t[k]
-        method = CommutatorFree4(self.robot.model, (over[1] - over[0]) * h / steps)
+        method = CommutatorFree4(self.robot.model, h / steps)
 
         def rate(t: float, q: Array, v: Array) -> Array:
             u = self._in_base_axes(q, self._input(k, (t - start) / h))
             return self._aba.acceleration(q, v, u).copy()
 
         for step in range(steps):
-            q, v = method.step(rate, start + over[0] * h + step * method.dt, q, v)
+            q, v = method.step(rate, start + step * method.dt, q, v)
         return q, v
 
     @cached_property

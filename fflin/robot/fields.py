@@ -118,9 +118,9 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
             )
         return dict(robot.urdf_damping)
     if what != "rest" and not isinstance(value, Mapping):
-        value = dict.fromkeys(robot.own_joints, value)
+        value = dict.fromkeys(robot._bare.joint_names, value)
     values = numbers(what, value, "joint", f"{what} of joint")
-    found = by_joint(values, robot.own_joints, robot.joint)
+    found = by_joint(values, robot._bare.joint_names, robot.joint)
     for name, entry in found.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")

@@ -6,17 +6,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, ArrayLike, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 

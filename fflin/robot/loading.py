@@ -26,7 +26,7 @@ from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic, is_impossible
-from fflin.robot.urdf.reader import read_urdf
+from fflin.robot.urdf.reader import ignored, read_urdf
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
@@ -147,7 +147,7 @@ def load(
     # Fields of the robot resolve some warnings, if they name all joints of the warning.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
-    for field, names, text in urdf.advice:
+    for field, names, text in ignored(urdf.joints, found.path.stem):
         said = {*getattr(loaded, field, ()), *gone}
         said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
         if not {*names} <= said:

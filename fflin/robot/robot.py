@@ -385,13 +385,7 @@ class Robot(Coordinates):
         wheels = named_wheels(self.inputs)
         return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
 
-    @cached_property
-    def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
-        """Angular momentum stored in the wheels without inertia, by the joint that carries them.
-
-        Each entry is the joint index and the vector (3,) [N m s] in joint axes.
-        """
-        return stored_momentum(self.model, self.inputs)
+    stored_momentum = cached_property(stored_momentum)
 
     @cached_property
     def springs(self) -> Springs:
@@ -439,11 +433,6 @@ class Robot(Coordinates):
     def modes(self) -> tuple[Joint, ...]:
         """Joints of the robot that represent modes of flexible appendages or slosh."""
         return tuple(joint for joint in self.joints if joint.mode)
-
-    @property
-    def own_joints(self) -> tuple[str, ...]:
-        """Names of the independent joints except wheels and modes."""
-        return self._bare.joint_names
 
     @property
     def _bare(self) -> Robot:

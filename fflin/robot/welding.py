@@ -1,8 +1,5 @@
 """Welding of joints at given values, and of one robot to a frame of another."""
 
-from __future__ import annotations
-
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
@@ -15,9 +12,9 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import equipped
-from fflin.robot.equipment.mounting import Mounted, carry_over, with_mounted
+from fflin.robot.equipment.mounting import carry_over
 from fflin.robot.inputs import ReactionWheel, named_inputs
-from fflin.robot.joints import ROOT, Follower, Joint, find_frame, joint_of
+from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import LinkMass, dynamic_parameters
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
@@ -84,9 +81,6 @@ def locked_model(
         locked.append(f"{name}={0.0 if value is None else value!r}")
         if value is not None:
             joint_of(model, index).place(q, value)
-        # Models built in code may lack the joint's frame, without which Pinocchio crashes.
-        if not model.existFrame(name, pin.FrameType.JOINT):
-            model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
     return _reduced(model, indices, q), left, tuple(locked)
 
@@ -103,20 +97,21 @@ def requested(lock: object) -> dict[str, float | None]:
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
-    """Weld joints at q (nq,)."""
-    # Pinocchio finds frames by name, and a link and a joint may share a name. So frames of links
-    # are renamed temporarily.
-    names = Counter(frame.name for frame in model.frames.tolist())
-    shared: dict[str, str] = {}
+    """Return a model with joints welded at q (nq,)."""
+    model = model.copy()
+    # Models built in code may lack a joint's frame, without which Pinocchio crashes.
+    for index in indices:
+        if not model.existFrame(model.names[index], pin.FrameType.JOINT):
+            model.addJointFrame(index)
+    # Pinocchio finds frames by name, and a link and a joint may share a name. So all frames except
+    # those of joints have numbers for names until the joints are welded.
+    names = {}
     for index, frame in enumerate(model.frames):
-        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
-            alias = f"{index}/{frame.name}"
-            while alias in names:
-                alias += "/"
-            shared[alias], frame.name = frame.name, alias
+        if index and frame.type != pin.FrameType.JOINT:
+            names[f"\0{index}"], frame.name = frame.name, f"\0{index}"
     reduced = pin.buildReducedModel(model, indices, q)
     for frame in reduced.frames:
-        frame.name = shared.get(frame.name, frame.name)
+        frame.name = names.get(frame.name, frame.name)
     return reduced
 
 
@@ -126,13 +121,12 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     The names of the other robot become PREFIX.NAME, and its joints have no motors.
     """
     bare = robot._bare
-    joint, at = find_frame(bare.model, frame)
     if not prefix or "." in prefix:
         raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
     taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
     if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
         raise InputError(f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix")
-    model = _joined(bare.model, joint, other.model.copy(), at * placement, prefix)
+    model = _appended(bare.model, frame, other.model, placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
         return joint._replace(name=f"{prefix}.{joint.name}").within(model)
@@ -165,30 +159,22 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     return equipped(replace(robot, name=name, attached=attached, **both), bare)
 
 
-def _joined(
-    model: pin.Model, joint: int, other: pin.Model, placement: pin.SE3, prefix: str
+def _appended(
+    model: pin.Model, frame: str, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return a model with the other model's joints inserted after all joints carried by `joint`."""
-    bodies = model.inertias.tolist()
-    bodies[joint] = bodies[joint] + placement.act(other.inertias[ROOT])
-    names = [f"{prefix}.{name}" for name in other.names]
-    parts = []
-    for index in range(ROOT + 1, other.njoints):
-        parent, at = other.parents[index], other.jointPlacements[index]
-        carrier, at = (joint, placement * at) if parent == ROOT else (names[parent], at)
-        moved = joint_of(other, index)._replace(name=names[index])
-        parts.append(Mounted(moved, carrier, at, other.joints[index], other.inertias[index]))
-    new = with_mounted(model, bodies, parts)
+    """Return a model with the other model's joints inserted after all joints carried by a frame."""
+    joint, at = find_frame(model, frame)
+    other = other.copy()
+    other.jointPlacements[ROOT] = pin.SE3.Identity()
+    added = _reduced(other, [ROOT], pin.neutral(other))
+    for index, name in enumerate(added.names.tolist()[1:], start=1):
+        added.names[index] = f"{prefix}.{name}"
+    for index, each in enumerate(added.frames):
+        each.name = f"{prefix}.{each.name}" if index else each.name
+    new = pin.appendModel(model, added, frame_index(model, frame), placement)
+    new.name, new.gravity = model.name, model.gravity
+    for part in (model, added):
+        carry_over(part, new)
     on = new.getJointId(model.names[joint])
-    others = {ROOT: on} | {i: new.getJointId(names[i]) for i in range(ROOT + 1, other.njoints)}
-    carry_over(other, new, {index: at for index, at in others.items() if index > ROOT})
-    new.addFrame(pin.Frame(prefix, on, placement, pin.FrameType.BODY), False)
-    for frame in other.frames.tolist()[1:]:
-        if frame.parentJoint >= ROOT:
-            copy = pin.Frame(frame)
-            copy.name, copy.parentJoint = f"{prefix}.{frame.name}", others[frame.parentJoint]
-            copy.parentFrame = 0
-            if frame.parentJoint == ROOT:
-                copy.placement = placement * frame.placement
-            new.addFrame(copy, False)
+    new.addFrame(pin.Frame(prefix, on, at * placement, pin.FrameType.BODY), False)
     return new

@@ -3,8 +3,6 @@
 Each run has a lane. If there is only one run, all lanes compute it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
@@ -368,7 +366,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     if isinstance(plan.policy, Allocation):
         asking = Plant(StateMap(plan.policy.design, reference=state.reference, frame=state.frame))
     law = no_law(state, np.zeros(len(asking.actuation.names)))
-    if isinstance(plan.policy, Allocation):
+    if asking is not plan.plant:
         law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))
     if isinstance(policy, LinearController | TrajectoryOutputFeedback):
         law = _filtered(law, plan, policy, asking, mechanics)
@@ -377,29 +375,26 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     elif isinstance(policy, StateFeedback | Gridded):
         law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx))
         x0 = policy.lin.x0
-        direct, grid = law.filter, law.grid
         if isinstance(policy, StateFeedback):
             K, offset, x0 = policy.terms(state)
-            direct = direct._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
+            direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
+            law = law._replace(filter=direct)
         else:
-            grid = _grid(policy, state.robot.joint_names)
-        law = law._replace(filter=direct, grid=grid, near=x0[state.groups.q_m].copy())
+            axes, gains = policy.table()
+            sizes = [len(values) for values in axes.values()]
+            grid = policies.Grid(
+                joint=[state.robot.joint_names.index(name) for name in axes],
+                first=np.cumsum([0, *sizes]),
+                values=np.concatenate(list(axes.values())),
+                stride=[np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))],
+                K=gains.ravel(),
+                offset=(policy.lin.u0 + gains @ policy.lin.x0).ravel(),
+                at=np.zeros(len(sizes)),
+            )
+            law = law._replace(grid=grid)
+        law = law._replace(near=x0[state.groups.q_m].copy())
     size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
-
-
-def _grid(policy: Gridded, joints: tuple[str, ...]) -> policies.Grid:
-    axes, gains = policy.table()
-    sizes = [len(values) for values in axes.values()]
-    return policies.Grid(
-        joint=[joints.index(name) for name in axes],
-        first=np.cumsum([0, *sizes]),
-        values=np.concatenate(list(axes.values())),
-        stride=[np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))],
-        K=gains.ravel(),
-        offset=(policy.lin.u0 + gains @ policy.lin.x0).ravel(),
-        at=np.zeros(len(sizes)),
-    )
 
 
 def _filtered(

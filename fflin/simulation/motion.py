@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base import record
 from fflin.base.errors import InputError
+from fflin.base.figures import Figure
 from fflin.base.record import Design
 from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import as_path, check_ending
@@ -24,9 +25,6 @@ from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
 from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FORMATS = (*record.FORMATS, ".csv")
 

@@ -13,11 +13,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
-from fflin.base.validation import Array, instance, number, truth, vector, whole
+from fflin.base.validation import Array, ArrayLike, instance, number, truth, vector, whole
 from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of

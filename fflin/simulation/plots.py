@@ -1,26 +1,19 @@
 """Charts of a motion, and its figure: states, inputs, errors and drifts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, cycle, drawing
+from fflin.base.figures import COLORS, Artist, Axes, Figure, cycle, drawing
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.report import STATES, Curve, curves
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
 # Titles of charts by the group and the unit of their curves, in the order of the charts.

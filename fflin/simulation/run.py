@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dposv
 
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, as_double, vector
+from fflin.base.validation import Array, ArrayLike, as_double, vector
 from fflin.control.policies import feedback_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.points import LARGEST_SPEED
@@ -48,7 +48,7 @@ _LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
 
-class Plant:
+class Plant(Aba):
     """The nonlinear robot under inputs (in the axes of the state's frame) and a disturbance."""
 
     def __init__(
@@ -57,13 +57,10 @@ class Plant:
         disturbance: Disturbance | None = None,
         faults: ActuatorFaults | None = None,
     ) -> None:
-        robot = state.robot
+        self.robot = robot = state.robot
         require_inertia(robot)
-        self.state, self.robot = state, robot
-        self._aba = Aba(state)
-        self.actuation = self._aba.actuation
+        super().__init__(state)
         self.disturbance = disturbance
-        self._model, self._data = robot.model, robot.create_data()
         nu, groups = len(self.actuation.names), self.actuation.groups
         # Index of the first of the three inputs of each vector on the base.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
@@ -78,7 +75,6 @@ class Plant:
         # Whether only u acts on the robot, with a constant input matrix.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
-        self.field = self._aba.field
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
@@ -105,7 +101,7 @@ class Plant:
             if np.abs(v).max() < _DIVERGED:
                 expected = "a generalised force (nv,) in Pinocchio's order"
                 disturbed = vector(name, disturbed, self.robot.nv, expected)
-        rate = self._aba.acceleration(q, v, u, disturbed)
+        rate = self.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
         if self.field:
             nu = self.state.velocities(v)
@@ -280,7 +276,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
     channel = None if law is None else plan.channel(law, lambda t, q, v: v[plan.wheels])
-    ask = channel.ask if channel and channel.continuous else None
+    ask = partial(channel.begin, 0) if channel and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
     follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt

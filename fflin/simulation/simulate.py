@@ -9,17 +9,15 @@ from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
-from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
@@ -31,14 +29,7 @@ from fflin.simulation.run import Conserved, Disturbance, Recording, go
 # In the deviation, the robot's states come first, then those of a continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
-# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
-# once.
-_FRACTION, _COMPILING = 0.1, 30.0
-
-
-_FASTER = "(faster: --engine compiled) "
-
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop.
 _log = logging.getLogger("fflin")
 
 
@@ -204,14 +195,12 @@ def simulate(
     """
     plan = Plan(SimulationOptions(**locals()))
     foresees, compiled = predictor(plan), engine_of(engine, plan) == "compiled"
-    slower, began = not (compiled or not_compilable(plan)), perf_counter()
+    hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
+    began = perf_counter()
     try:
-        run = recorded(plan) if compiled else go(plan, _FASTER if slower else "")
-        spent = perf_counter() - began
-        if spent > LONG_RUN and slower:
-            once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-            said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
-            _log.warning(f"fflin: {said} would take about %.0f s%s", spent, _FRACTION * spent, once)
+        run = recorded(plan) if compiled else go(plan, hint)
+        if hint and (spent := perf_counter() - began) > LONG_RUN:
+            _log.warning("fflin: a simulation took %.0f s in Python %s", spent, hint)
         return motion_of(plan, run, foresees)
     except MemoryError:
         raise InputError(
@@ -329,7 +318,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
-            rate = lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0
+            rate = lin.A @ at + lin.B @ (channel.begin(0, at) - u0) + lin.f0
             after = after + weight * dt / 6.0 * rate
         return after
 

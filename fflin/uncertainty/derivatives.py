@@ -4,8 +4,6 @@ M and RNEA are linear in the ten dynamic parameters of each body. So their deriv
 to a dynamic parameter is M or RNEA of a robot in which this parameter is 1 and all others are 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
@@ -90,18 +88,22 @@ class ModelDerivatives:
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
-        rates = self._rates_over(parameters)
         # A, B and f0 are affine in the rates. The additional last row has zero rates, so it gives
         # the constant part, which is subtracted below.
-        state, ready, count, nv = self._state, self._ready, len(rates.c) + 1, len(self._nu)
+        state, ready, count, nv = self._state, self._ready, len(parameters) + 1, len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
-        with_none = AccelerationDerivatives(
-            np.zeros((count, nv)), A[:, nv:], B[:, nv:], np.zeros((count, 3))
-        )
-        for part, of_parameters in zip(with_none, rates, strict=True):
-            part[:-1] = of_parameters
+        c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
+        rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
+        for row, one in enumerate(parameters):
+            for joint, change in one.bodies.items():
+                for part, of_bodies in zip(rates, self._of_bodies, strict=True):
+                    part[row] += np.tensordot(change, of_bodies[joint - ROOT], 1)
+            if not one.bodies:
+                for part, of_force in zip(rates, self._over_force(one), strict=True):
+                    part[row] = of_force
+        seen = self._seen(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
-        f0 = assemble(state, ready.actuation, self._chart, nu, u, with_none, A, moving=ready.moving)
+        f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
@@ -109,7 +111,7 @@ class ModelDerivatives:
                 given = np.column_stack((B[row], f0[row]))
                 A[row], held = held_derivatives(self._source.A, driven, h, A[row], given)
                 B[row], f0[row] = held[:, :-1], held[:, -1]
-        C, D, y0 = np.split(self._seen(parameters, rates), (state.nx, -1), axis=2)
+        C, D, y0 = np.split(seen, (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
 
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
@@ -174,33 +176,34 @@ class ModelDerivatives:
             worst = max(worst, float(np.abs(by_steps - exact).max() / size))
         return worst
 
-    def _rates_over(self, parameters: Sequence[Parameter]) -> AccelerationDerivatives:
-        """Return the derivatives (P, ..) of the rates over P parameters."""
-        changes = np.zeros((len(parameters), 10 * len(self._joints)))
-        for row, one in enumerate(parameters):
-            for joint, change in one.bodies.items():
-                changes[row, 10 * (joint - ROOT) :][:10] = change
-        parts = [np.tensordot(changes, part, 1) for part in self._of_bodies]
-        for row, one in enumerate(parameters):
-            if not one.bodies:
-                for part, own in zip(parts, self._over_force(one), strict=True):
-                    part[row] = own
-        return AccelerationDerivatives(*parts)
-
     @cached_property
     def _of_bodies(self) -> AccelerationDerivatives:
-        """Derivatives (bodies * 10, ..) of the rates, in Pinocchio's joint order."""
-        rates, size = self._rates, len(self._inverse)
-        given = np.concatenate((rates.by_u, rates.slopes), axis=1)
-        moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
-        by_u, by_state = np.split(moved, rates.by_u.shape[1:], axis=2)
+        """Derivatives (bodies, 10, ..) of the rates, in Pinocchio's joint order."""
+        rates = self._rates
+        by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
+        count = by_u.shape[:2]
         found = AccelerationDerivatives(
-            np.zeros((len(moved), size)), by_state, by_u, np.zeros((len(moved), 3))
+            np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            F, F_q, F_nu, F_turn = self._forces()
+            # F_p and its derivatives over q_m, nu and base rotations, of bodies one at a time.
+            lone = self.robot.model.copy()
+            lone.armature = np.zeros_like(lone.armature)
+            for joint in range(lone.njoints):
+                lone.inertias[joint] = pin.Inertia.Zero()
+            forces: tuple[list[Array], ...] = ([], [], [], [])
+            for joint in self._joints:
+                of_bodies = []
+                for body in _BODIES:
+                    lone.inertias[joint] = body
+                    of_bodies.append(self._rnea_derivatives(lone))
+                lone.inertias[joint] = pin.Inertia.Zero()
+                for kept, values in zip(forces, zip(*of_bodies, strict=True), strict=True):
+                    kept.append(np.tensordot(_OF_BODIES, values, 1))
+            F, F_q, F_nu, F_turn = map(np.array, forces)
             found.c[:] = -F @ self._inverse
-            F_q += [self._by_acceleration(each) for each in found.c]
+            for body, at in np.ndindex(count):
+                F_q[body, at] += self._by_acceleration(found.c[body, at])
             found.by_q_m[:] -= self._inverse @ F_q
             found.by_nu[:] -= self._inverse @ F_nu
             found.by_turn[:] -= self._inverse @ F_turn
@@ -223,29 +226,8 @@ class ModelDerivatives:
     def _by_inertia(self, given: Array) -> Array:
         """Return -M^-1 M_p (bodies, 10, 6 + n, k) times a matrix (6 + n, k)."""
         J = self._jacobians()
-        bodies, _, size = J.shape
-        X, k = J @ self._inverse, given.shape[1]
-        Z = UNITS.reshape(60, 6) @ (J @ given)
-        Z = Z.reshape(bodies, 10, 6, k).transpose(0, 2, 1, 3).reshape(bodies, 6, 10 * k)
-        product = -(X.mT @ Z)
-        return product.reshape(bodies, size, 10, k).transpose(0, 2, 1, 3)
-
-    def _forces(self) -> tuple[Array, ...]:
-        """Return F_p (bodies * 10, 6 + n) and its derivatives over q_m, nu and base rotations."""
-        lone = self.robot.model.copy()
-        lone.armature = np.zeros_like(lone.armature)
-        for joint in range(lone.njoints):
-            lone.inertias[joint] = pin.Inertia.Zero()
-        found: tuple[list[Array], ...] = ([], [], [], [])
-        for joint in self._joints:
-            of_bodies = []
-            for body in _BODIES:
-                lone.inertias[joint] = body
-                of_bodies.append(self._rnea_derivatives(lone))
-            lone.inertias[joint] = pin.Inertia.Zero()
-            for kept, values in zip(found, zip(*of_bodies, strict=True), strict=True):
-                kept.append(np.tensordot(_OF_BODIES, values, 1))
-        return tuple(np.concatenate(each) for each in found)
+        forces = UNITS @ (J @ given)[:, None]
+        return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
         """Return the forces of RNEA and their derivatives over q_m, nu and base rotations.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -30,13 +30,10 @@ from fflin.base.rotation import skew
 from fflin.base.tables import counted, cut, folded, grid
 from fflin.base.validation import Array, Vector, as_double, numbers
 from fflin.linear.linearization import Prepared
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, state_space
 from fflin.robot.mass_properties import Piece
 from fflin.uncertainty.derivatives import UNITS
 from fflin.uncertainty.parameters import AXES, ENTRIES, OF_PIECES, Parameter
-
-if TYPE_CHECKING:
-    import control
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -177,7 +174,7 @@ class LFT(Design):
             self.D22 + self.D21 @ by[..., nx:],
         )
 
-    def to_control(self) -> control.StateSpace:
+    def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.
 
         The channels of w and z have names such as ``w_PARAMETER_1`` and ``z_PARAMETER_1``. Dots in
@@ -234,23 +231,22 @@ def linear_fractional(
     lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
 ) -> LFT:
     """Return the LFT of a model about a point at rest without forces."""
-    form = _Form(ready, lin.q, [each for block in blocks for each in block.ranges])
-    of_pieces: dict[str, dict[str, int]] = {}
-    of_modes: dict[str, dict[str, int]] = {}
-    robot = ready.robot
-    modes = {joint.name for joint in robot.modes if robot.stiffness.get(joint.name)}
-    for at, each in enumerate(form.ranges):
-        one = each.parameter
-        if one.of in pieces and one.part in OF_PIECES:
-            of_pieces.setdefault(one.of, {})[one.part] = at
-        elif one.of in modes and one.joint >= 0:
-            of_modes.setdefault(one.of, {})[one.part] = at
+    form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
+    # Parameters of a link or a mode act together: {(link or mode, its joint): {part: index}}.
+    together: dict[tuple[str, int], dict[str, int]] = {}
+    sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
+    modes = sprung & {joint.name for joint in ready.robot.modes}
+    for at, (one, *_) in enumerate(form.ranges):
+        is_piece = one.of in pieces and one.part in OF_PIECES
+        if is_piece or (one.joint >= 0 and one.of in modes):
+            together.setdefault((one.of, one.joint), {})[one.part] = at
         else:
             form.add_alone(at)
-    for name, parts in of_pieces.items():
-        form.add_piece(pieces[name], parts)
-    for name, parts in of_modes.items():
-        form.add_mode(robot.joint_names.index(name), parts)
+    for (name, joint), parts in together.items():
+        if joint >= 0:
+            form.add_mode(joint, parts)
+        else:
+            form.add_piece(pieces[name], parts)
     taken = (np.arange(_MOST) < form.used[:, None]).ravel()
     ends = np.cumsum([len(block.ranges) for block in blocks])[:-1]
     repeats = [float(each.sum()) for each in np.split(form.used, ends)]
@@ -285,20 +281,19 @@ class _Form:
     Signals are rows over (a, x, u, w). Each parameter adds rows to z and terms to the force.
     """
 
-    def __init__(self, ready: Prepared, q: Array, ranges: Sequence[Range]) -> None:
+    def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
         state, robot, data = ready.map, ready.robot, ready.robot.create_data()
         self.state, self.ranges = state, ranges
-        centred = q.copy()  # with the base at the origin
+        centred = lin.q.copy()  # with the base at the origin
         centred[:3] = 0.0
         columns = np.array(ready.actuation.columns(data, centred))
         pin.computeJointJacobians(robot.model, data, centred)
-        M = np.diag(state.project(np.diag(robot.model.armature)).diagonal())
-        self.jacobians: dict[int, Array] = {}
-        for joint in range(1, robot.model.njoints):
-            J = state.columns(pin.getJointJacobian(robot.model, data, joint, _LOCAL))
-            M += J.T @ robot.model.inertias[joint].matrix() @ J
-            self.jacobians[joint] = J
-        self.ends = np.cumsum((len(M), state.nx, columns.shape[1], _MOST * len(ranges)))
+        self.jacobians = {
+            joint: state.columns(pin.getJointJacobian(robot.model, data, joint, _LOCAL))
+            for joint in range(1, robot.model.njoints)
+        }
+        nv, nu = columns.shape
+        self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
         # Every parameter has places for _MOST signals, of which it takes as many as it needs.
@@ -306,9 +301,9 @@ class _Form:
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
         # Inertial and spring forces minus input forces. The equation of motion sets this sum to
         # zero.
-        self.force = np.zeros((len(M), self.ends[-1]))
+        self.force = np.zeros((nv, self.ends[-1]))
         by_a, by_x, by_u, _ = self.parts(self.force)
-        by_a[:], by_u[:] = M, -columns
+        by_a[:], by_u[:] = lin.M, -columns
         by_x[6:, state.groups.q_m] = np.diag(robot.springs.stiffness)
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 

@@ -1,7 +1,5 @@
 """Named parameters of a robot, their effect per unit, and robots with changed parameters."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Exact derivatives of a linear model with respect to the robot's parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

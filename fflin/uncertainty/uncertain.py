@@ -1,7 +1,5 @@
 """Robot with uncertain parameters: linear-fractional model, samples and worst case."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
@@ -136,15 +134,13 @@ class Uncertain:
         found, lost = list[Array](), 0
         while len(found) < count:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
-            if why := self._refusal(delta):
-                lost += 1
-                if lost >= _TRIES * (len(found) + 1):
-                    raise InputError(
-                        f"only {len(found)} of {lost + len(found)} robots drawn from these ranges "
-                        f"are valid: {why}; give narrower ranges"
-                    )
-                continue
-            found.append(delta)
+            if not (why := self._refusal(delta)):
+                found.append(delta)
+            elif (lost := lost + 1) >= _TRIES * (len(found) + 1):
+                raise InputError(
+                    f"only {len(found)} of {lost + len(found)} robots drawn from these ranges "
+                    f"are valid: {why}; give narrower ranges"
+                )
         return np.array(found), lost
 
     def values(self, delta: Array) -> dict[str, float]:

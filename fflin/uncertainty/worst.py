@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import islice, pairwise, product
-from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -249,15 +248,12 @@ def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> 
         steps = _LENGTHS[:, None] * gradient / max(np.abs(gradient).max(), 1e-300)
         alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
         trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
-        held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
-        ahead = max(
-            ((float(exact(x[None])[0]), x) for x in held),
-            key=itemgetter(0),
-            default=(value, delta),
-        )
-        if not ahead[0] > value + 1e-9 * abs(value):
+        before = value
+        for trial in islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD):
+            if (reached := float(exact(trial[None])[0])) > value:
+                value, delta = reached, trial
+        if not value > before + 1e-9 * abs(before):
             break
-        value, delta = ahead
     return value, delta
 
 

@@ -64,14 +64,14 @@ class Live:
         frame: str | None,
     ) -> None:
         self.robot, self._speed = robot, speed
-        self._data, self._state_map = robot.model.createData(), StateMap(robot)
-        self._ranges, self._lock = _ranges(robot), threading.Lock()
+        self._state_map, self._ranges = StateMap(robot), _ranges(robot)
+        self._lock = threading.Lock()
         # Clock time and simulation time [s] at the beginning of the shown simulation.
         self._began: tuple[float, float] | None = None
         self._running, self._state, self._clients = False, "{}", set[_Socket]()
         self._page = page = Page(robot, scene, tool, frame, self._send)
         self.meshcat, self.notes = page.meshcat, page.drawing.notes
-        poses = body_poses(robot, self._data, q)
+        poses = body_poses(robot, q)
         page.set_stage(poses, subtitle(robot))
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         sliders = [
@@ -134,7 +134,7 @@ class Live:
         q = self.robot.checked_configuration(q).copy()
         q.setflags(write=False)
         with self._lock:
-            poses = body_poses(self.robot, self._data, q)
+            poses = body_poses(self.robot, q)
             inertia = self._state_map.project(inertia_at(self.robot, q))
             scale = np.sqrt(np.diag(inertia))
             state = {

@@ -3,8 +3,6 @@
 Wheels and thrusters are drawn at their places on the links.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import math
@@ -23,9 +21,8 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.mounting import turned_to
-from fflin.robot.inputs import Thruster, named_wheels
+from fflin.robot.inputs import Thruster, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.view.scene import Drawing, Visualizer
@@ -150,18 +147,15 @@ class Page:
         # Path of each body's node, in the order of Pinocchio's joints from 1 on.
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
         self.entries: dict[str, object] = {}
-        # Each thruster's name, with its node and its position and force direction there.
-        self.nozzles: list[tuple[str, dict[str, object]]] = [
-            (
-                name,
-                {
-                    "path": self.nodes[joint - ROOT],
-                    "position": position.tolist(),
-                    "direction": direction.tolist(),
-                },
-            )
-            for name, joint, position, direction in thrusters(robot)
-        ]
+        # Name, node, position and force direction of each thruster.
+        self.nozzles: list[dict[str, object]] = []
+        for item, (name, *_) in named_inputs(robot.inputs):
+            if isinstance(item, Thruster):
+                joint, placement = find_frame(robot.model, item.frame)
+                nozzle: dict[str, object] = {"name": name, "path": self.nodes[joint - ROOT]}
+                nozzle["position"] = placement.act(np.array(item.position)).tolist()
+                nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
+                self.nozzles.append(nozzle)
         self.floor = [0.0, 0.0, 0.0]  # [m] point of the floor below the robot
         self.size = 1.0  # [m] radius of the robot in the first frame
 
@@ -189,11 +183,10 @@ class Page:
                 "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
                 "orbit": {"body": robot.orbit.body, "distance": far, "rate": rate},
             }
-        triads = [{"path": nodes[0], "length": 0.3 * size, **_placed(pin.SE3.Identity())}]
+        triads = [{"path": nodes[0], **_placed(pin.SE3.Identity())}]
         if self.tool:
             joint, placement = find_frame(robot.model, self.tool)
-            triad = {"path": nodes[joint - ROOT], "length": 0.12 * size, **_placed(placement)}
-            triads.append(triad)
+            triads.append({"path": nodes[joint - ROOT], **_placed(placement)})
         named, wheels = named_wheels(robot.inputs), list[dict[str, object]]()
         for name, wheel in named:
             joint, at = find_frame(robot.model, wheel.frame)
@@ -206,7 +199,7 @@ class Page:
         self.entries = {
             **orbit,
             "triads": triads,
-            "nozzles": [nozzle for _, nozzle in self.nozzles],
+            "nozzles": self.nozzles,
             "wheels": wheels,
             "links": {k: link for each in (self.drawing, *held) for k, link in each.links.items()},
             "title": robot.name,
@@ -245,20 +238,6 @@ class Page:
         return parts[0] + "".join(
             fields[name] + rest for name, _, rest in (part.partition("}}") for part in parts[1:])
         )
-
-
-def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
-    """Return each thruster's name, joint, and position and force direction in the joint's frame."""
-    found: list[tuple[str, int, Array, Array]] = []
-    actuation = Actuation(StateMap(robot))
-    names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
-    for item in robot.inputs:
-        if isinstance(item, Thruster):
-            joint, placement = find_frame(robot.model, item.frame)
-            position = placement.act(np.array(item.position))
-            direction = placement.rotation @ np.array(item.direction)
-            found.append((names[len(found)], joint, position, direction))
-    return found
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:

@@ -7,27 +7,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.modes import Mode, Modes, energies_of
 from fflin.base.errors import InputError
+from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.joints import find_frame, find_joint, frame_index
+from fflin.robot.joints import find_frame, find_joint
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.run import Plant
 from fflin.view.page import Page, packed, subtitle
 from fflin.view.panel import panel
-from fflin.view.scene import Drawing, animation, body_poses
+from fflin.view.scene import Drawing, body_poses
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
@@ -37,9 +37,6 @@ if TYPE_CHECKING:
 # size.
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
-
-TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
-FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
 # Length of the largest force's arrow. The camera follows the base by default if its path is longer
 # than _FAR. Both are in robot sizes.
@@ -54,36 +51,35 @@ _MOST_FRAMES = 3000
 
 
 def motion_page(
-    robot: Robot,
+    page: Page,
     motion: Motion,
     *,
-    scene: str,
     fps: float,
     speed: float,
     follow: bool | None,
     target: Array | None,
-    tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and notes about missing drawings; see `visualize`."""
-    shown = frame_indices(motion.t, fps, speed)
+    robot, shown = page.robot, frame_indices(motion.t, fps, speed)
     frame = cast("Frame", motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
-    film = play_back(robot, state, motion.q[shown], motion.u[shown], tool)
-    goal = _target(motion, state, shown) if target is None else target[None]
-    data = robot.model.createData()
-    # One pose if the target is fixed, or one for each frame.
-    goals = np.array([body_poses(robot, data, each) for each in goal])
+    film = play_back(state, motion.q[shown], motion.u[shown])
+    if target is None:  # none, one, or one for each frame
+        states = motion.target.reshape(-1, state.nx)
+        states = states[shown] if len(states) > 1 else states
+        goal = np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, robot.nq)
+    else:
+        goal = target[None]
+    goals = body_poses(robot, goal)
 
-    page = Page(robot, scene, tool, frame)
     drawing, moving = page.drawing, [(page.drawing, film.poses)]
     if len(goals):
         ghost = page.draw(robot, "target", "ghost")
         ghost.place(goals[0])
         moving += [(ghost, goals)] if len(goals) > 1 else []
     if motion.linear is not None:
-        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
-        poses = np.array([body_poses(robot, data, each) for each in predicted])
-        moving.append((page.draw(robot, "linear", "linear"), poses))
+        predicted = np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
+        moving.append((page.draw(robot, "linear", "linear"), body_poses(robot, predicted)))
     held = []
     for caught, poses in payloads(motion, frame, shown):
         name = caught.prefix
@@ -93,7 +89,10 @@ def motion_page(
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
-    page.window.record(animation(clips))
+    options = {"play": True, "repetitions": 1}
+    page.window.record(
+        {"type": "set_animation", "animations": clips, "options": options, "path": ""}
+    )
 
     # Robots of the phases, if known. After a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
@@ -128,13 +127,6 @@ def motion_page(
     return html, tuple(dict.fromkeys(note for each in drawn for note in each.notes))
 
 
-def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
-    """Return the targets (k, nq) of a motion: none, one, or one for each frame."""
-    states = motion.target.reshape(-1, state.nx)
-    states = states[shown] if len(states) > 1 else states
-    return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
-
-
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: body corners and force tips."""
     chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
@@ -150,53 +142,41 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
-    trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
+    trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
-        trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
+        trails, followed = {"base": film.poses[:, 0, :3]}, {"base": goals[:, 0, :3]}
     if page.tool:
-        trails.insert(0, ("tool", TOOL_COLOR, film.tool))
+        joint, at = find_frame(page.robot.model, page.tool)
+        trails = {"tool": moved(film.poses[:, joint - ROOT], at.translation), **trails}
         if followed:
-            joint, at = find_frame(page.robot.model, page.tool)
-            ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
-            followed["tool"] = np.array(ends)
-    arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
-    size = page.size
-    most = float(np.abs(film.thrust).max(initial=0.0))
+            followed["tool"] = moved(goals[:, joint - ROOT], at.translation)
     return {
-        "trails": [
-            {"name": name, "colour": color, "points": packed(points), "radius": 0.0055 * size}
-            for name, color, points in trails
-        ],
-        "followed": [
-            {"name": name, "points": packed(points), "radius": 0.004 * size}
-            for name, points in followed.items()
-        ],
+        "trails": [{"name": name, "points": packed(points)} for name, points in trails.items()],
+        "followed": [{"points": packed(points)} for points in followed.values()],
         "arrows": [
-            {
-                "kind": kind,
-                "longest": ARROW * size,
-                "colour": color,
-                "values": packed(values),
-                "most": float(np.linalg.norm(values, axis=1).max()),
-            }
-            for kind, color, values in arrows
+            {"kind": kind, "longest": ARROW * page.size, "values": packed(values)}
+            for kind, values in (("force", film.force), ("torque", film.torque))
             if np.any(values)
         ],
         "plumes": [
-            {**nozzle, "values": packed(film.thrust[:, k]), "most": most, "name": name}
-            for k, (name, nozzle) in enumerate(page.nozzles)
-            if most
+            {**nozzle, "values": packed(film.thrust[:, k])}
+            for k, nozzle in enumerate(page.nozzles)
+            if film.thrust.any()
         ],
     }
 
 
-@dataclass(frozen=True)
-class Playback:
+def moved(poses: Array, point: Array) -> Array:
+    """Return the positions (N, 3) of a point (3,) that moves with poses (N, 7)."""
+    found: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
+    return found
+
+
+class Playback(NamedTuple):
     """Poses, trails and forces of a motion at N frames."""
 
     poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
     com: Array  # (N, 3) [m]
-    tool: Array  # (N, 3) origin of the tool [m]
     force: Array  # (N, 3) [N] on the base, in world axes
     torque: Array  # (N, 3) [N m] on the base, in world axes
     thrust: Array  # (N, k) [N] of k thrusters
@@ -213,29 +193,23 @@ def frame_indices(t: Array, fps: float, speed: float) -> Array:
     return np.unique(after)
 
 
-def play_back(robot: Robot, state: StateMap, q: Array, u: Array, tool: str | None) -> Playback:
+def play_back(state: StateMap, q: Array, u: Array) -> Playback:
     """Compute the data of an animation from rows of a motion; wrenches are in the state's frame."""
-    model, data = robot.model, robot.model.createData()
-    tool_id = frame_index(model, tool) if tool else None
-    groups = Actuation(state).groups
+    robot, data, groups = state.robot, state.robot.create_data(), Actuation(state).groups
+    poses = body_poses(robot, q)
+    com = np.array([pin.centerOfMass(robot.model, data, row).copy() for row in q])
+    turned = rotation_matrices(poses[:, 0, 3:])
 
-    def frame(q_k: Array, u_k: Array) -> tuple[Array, ...]:
-        poses = body_poses(robot, data, q_k)
-        com = pin.centerOfMass(model, data, q_k).copy()
-        base = data.oMi[ROOT]
-        end = base if tool_id is None else pin.updateFramePlacement(model, data, tool_id)
-        force, torque = (
-            (state.reference if relative else base).rotation @ u_k[groups[kind]]
-            if kind in groups
-            else np.zeros(3)
-            for kind, relative in (("F_b", state.axes[1]), ("tau_b", state.axes[0]))
-        )
-        return poses, com, end.translation.copy(), force, torque
+    def in_world(kind: str, relative: bool) -> Array:
+        if kind not in groups:
+            return np.zeros((len(q), 3))
+        wrench: Array = (state.reference.rotation if relative else turned) @ u[
+            :, groups[kind], None
+        ]
+        return wrench[..., 0]
 
-    frames = [frame(q_k, u_k) for q_k, u_k in zip(q, u, strict=True)]
-    thrust = u[:, groups.get("thrust", np.zeros(0, dtype=int))]
-    poses, com, tools, force, torque = map(np.array, zip(*frames, strict=True))
-    return Playback(poses, com, tools, force, torque, thrust)
+    force, torque = in_world("F_b", state.axes[1]), in_world("tau_b", state.axes[0])
+    return Playback(poses, com, force, torque, u[:, groups.get("thrust", np.zeros(0, dtype=int))])
 
 
 def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
@@ -256,7 +230,7 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
 def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     """Return the poses of an undamped, free payload at times [s] before its capture."""
     payload = caught.payload.replace(damping=0.0)
-    data, state = payload.create_data(), StateMap(payload, frame=frame)
+    state = StateMap(payload, frame=frame)
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
@@ -267,7 +241,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
             take = CommutatorFree4(payload.model, (time - now) / steps).step
             q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
         now = time
-        poses.insert(0, body_poses(payload, data, q))
+        poses.insert(0, body_poses(payload, q))
     return poses
 
 
@@ -283,11 +257,9 @@ def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
     return poses
 
 
-def mode_page(
-    robot: Robot, found: Modes, *, scene: str, tool: str | None
-) -> tuple[str, tuple[str, ...]]:
+def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
     """Return the page of a robot's modes, and notes about missing drawings; see `visualize`."""
-    lin = found.lin
+    robot, lin = page.robot, found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
         raise InputError(
@@ -300,8 +272,7 @@ def mode_page(
             f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
             "joints a stiffness"
         )
-    page = Page(robot, scene, tool, lin.frame)
-    at_rest = body_poses(robot, robot.model.createData(), lin.q)
+    at_rest = body_poses(robot, lin.q)
     page.drawing.place(at_rest)
     page.draw(robot, "rest", "ghost").place(at_rest)
     page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
@@ -326,19 +297,16 @@ def mode_page(
 def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
     """Return poses (_PHASES, njoints - 1, 7) over a period of x0 + Re(a shape exp(i phase))."""
     robot, half = state.robot, len(lin.x0) // 2
-    data = robot.model.createData()
 
     def poses(amplitude: float) -> Array:
-        found = []
-        for phase in np.arange(_PHASES) * (2.0 * math.pi / _PHASES):
-            x = lin.x0.copy()
-            x[:half] += amplitude * (mode.shape[:half] * np.exp(1j * phase)).real
-            found.append(body_poses(robot, data, state.to_pinocchio(x)[0]))
-        return np.array(found)
+        x = np.repeat(lin.x0[None], _PHASES, axis=0)
+        turns = np.exp(2j * math.pi * np.arange(_PHASES)[:, None] / _PHASES)
+        x[:, :half] += amplitude * (mode.shape[:half] * turns).real
+        return body_poses(robot, state.points(x)[1])
 
     # Displacement of the corners per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    rest = drawing.points(body_poses(robot, data, lin.q))
+    rest = drawing.points(body_poses(robot, lin.q))
     moved = np.array([drawing.points(each) - rest for each in poses(small)])
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [

@@ -1,20 +1,14 @@
 """The panel beside a motion: errors, states, inputs and limits over time."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.robot.robot import Robot
+from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve
 from fflin.view.page import packed
-
-if TYPE_CHECKING:
-    from fflin.simulation.motion import Motion
 
 # Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14

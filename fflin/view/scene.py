@@ -30,16 +30,19 @@ _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x
 _ELSEWHERE: dict[str, object] = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
-def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
-    """Return the poses (njoints - 1, 7) of all joint frames at q (nq,).
+def body_poses(robot: Robot, q: Array) -> Array:
+    """Return the poses (.., njoints - 1, 7) of all joint frames at q (.., nq).
 
     The first mode of a flexible appendage has the pose of the appendage's bent frame.
     """
-    pin.forwardKinematics(robot.model, data, q)
-    poses = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
-    for bending in bendings(robot).values() if robot.appendages else ():
-        poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, q))
-    return poses
+    data, found = robot.model.createData(), []
+    for row in q.reshape(-1, robot.nq):
+        pin.forwardKinematics(robot.model, data, row)
+        poses = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]]
+        for bending in bendings(robot).values() if robot.appendages else ():
+            poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, row))
+        found.append(poses)
+    return np.array(found).reshape(*q.shape[:-1], robot.model.njoints - ROOT, 7)
 
 
 class Drawing:
@@ -138,12 +141,6 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
             if bending.node == shape.joint:
                 at = bending.frame.actInv(at)
     return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
-
-
-def animation(clips: Sequence[dict[str, object]]) -> dict[str, object]:
-    """Return the command that animates all moving nodes."""
-    options = {"play": True, "repetitions": 1}
-    return {"type": "set_animation", "animations": [*clips], "options": options, "path": ""}
 
 
 def typed(array: Array | Indices, kind: str = "<f4") -> object:

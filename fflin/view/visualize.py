@@ -157,8 +157,7 @@ def visualize(
     if not isinstance(scene, str) or scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     opened = None if open is None else truth("open", open)
-    check_tool(robot, tool)
-    tool = tool or default_tool(robot)
+    tool = tool_frame(robot, tool)
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
@@ -180,6 +179,8 @@ def visualize(
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     from fflin.analysis.modes import Modes
+    from fflin.view.page import Page
+    from fflin.view.pages import mode_page, motion_page
 
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
@@ -187,23 +188,18 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        from fflin.view.pages import mode_page
-
-        page, notes = mode_page(robot, motion, scene=scene, tool=tool)
+        found, notes = mode_page(Page(robot, scene, tool, motion.lin.frame), motion)
     else:
         robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-        from fflin.view.pages import motion_page
-
         goal = None if target is None else _configuration(robot, "target", target)
-        page, notes = motion_page(
-            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
-        )
-        contents = _pictures(page, outputs, motion, speed, times)
+        page = Page(robot, scene, tool, motion.frame)
+        found, notes = motion_page(page, motion, fps=fps, speed=speed, follow=follow, target=goal)
+        contents = _pictures(found, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
-    write_atomically(contents | ({shown: page.encode()} if shown else {}))
+    write_atomically(contents | ({shown: found.encode()} if shown else {}))
     if shown and (not outputs if opened is None else opened):
         import webbrowser
 
@@ -236,14 +232,11 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
     return outputs
 
 
-def check_tool(robot: Robot, tool: str | None) -> None:
-    """Raise `UnknownNameError` if the robot has no frame `tool`."""
+def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
+    """Return the frame `tool`; by default, "tool" or the last link of the longest chain."""
     if tool is not None:
         find_frame(robot.model, tool)
-
-
-def default_tool(robot: Robot) -> str | None:
-    """Return the name of the tool frame: "tool", or the last link of the longest chain."""
+        return tool
     model = robot.model
     if robot.n == 0:
         return None

@@ -134,7 +134,7 @@ def test_displacements_of_a_point_that_is_turned_from_the_reference(robots):
     turned = pin.SE3(pin.exp3(np.array([0.0, 2.6, 0.0])), np.zeros(3))
     q0 = fflin.configuration(robot, base=turned)
     lin = fflin.linearize(robot, q0, reference=pin.SE3.Identity())
-    loop = Loop(robot, lin, np.zeros((6, 12)))
+    loop = Loop(robot, lin, fflin.lqr(lin))
     for seed in range(8):  # on either side of a turn of 180 degrees from the reference
         x = loop.displaced(np.random.default_rng(seed), 100.0, 0.0, 0.0)
         q, _ = loop.state.to_pinocchio(x)

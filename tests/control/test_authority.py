@@ -8,18 +8,15 @@ import pytest
 from scipy.optimize import linprog
 
 import fflin
-from fflin.control.authority import (
-    least_reach,
-    mass_properties,
-    point_properties,
-    thruster_authority,
-    wheel_momenta,
-    wheel_momentum,
-)
+from fflin.control.authority import least_reach, point_properties, thruster_authority
 
 
-def thrusters_at(*point):
-    return str(thruster_authority(*point))
+def thrusters_at(robot, center):
+    return str(thruster_authority(robot, robot.neutral(), center))
+
+
+def wheels_at(robot, q, v):
+    return point_properties(robot, q, v).wheel_momentum
 
 
 def tilted(robot, **joints):
@@ -35,7 +32,7 @@ def test_mass_properties_are_those_of_the_bodies_in_base_axes():
     total = pin.Inertia.Zero()
     for place, body in zip(data.oMi.tolist()[1:], robot.model.inertias.tolist()[1:], strict=True):
         total += base.actInv(place).act(body)
-    center, inertia = mass_properties(robot, q)
+    center, inertia, *_ = point_properties(robot, q, np.zeros(robot.nv))
     np.testing.assert_allclose(center, total.lever, atol=1e-12)
     np.testing.assert_allclose(inertia, total.inertia, rtol=1e-12, atol=1e-9)
 
@@ -82,19 +79,24 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
         ]
     robot = fflin.load("cubesat", inputs=nozzles)
     # A force needs one pair, which gives 4 N; so does a torque, of 2 N m.
-    report = thrusters_at(robot, tilted(robot), np.zeros(3))
+    report = thrusters_at(robot, np.zeros(3))
     assert "least 4 N\n  without" in report and "2 N m without" in report
+    reports = [
+        str(point_properties(robot, q, np.zeros(robot.nv)).thruster_authority)
+        for q in (robot.neutral(), tilted(robot))
+    ]
+    assert reports[0] == reports[1]
     # It is the centre of mass that counts.
     center = np.array([0.2, -0.3, 0.1])
     moved = [replace(each, position=tuple(each.position + center)) for each in nozzles]
     moved = robot.replace(inputs=moved)
-    assert thrusters_at(moved, moved.neutral(), center) == report
-    assert thrusters_at(moved, moved.neutral(), np.zeros(3)) != report
+    assert thrusters_at(moved, center) == report
+    assert thrusters_at(moved, np.zeros(3)) != report
     few = robot.replace(inputs=nozzles[:-1])
-    said = thrusters_at(few, few.neutral(), np.zeros(3))
+    said = thrusters_at(few, np.zeros(3))
     assert "cannot produce a force and a torque in every direction" in said
     free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
-    assert "limit" in thrusters_at(free, free.neutral(), np.zeros(3))
+    assert "limit" in thrusters_at(free, np.zeros(3))
 
 
 def test_wheels_add_up_in_base_axes():
@@ -108,16 +110,16 @@ def test_wheels_add_up_in_base_axes():
     pin.framesForwardKinematics(robot.model, data, q)
     frame = data.oMf[robot.model.getFrameId("link_1")].rotation
     expected = [0.5, 0, 0] + data.oMi[1].rotation.T @ frame @ [0, 0, 3.0]
-    axes, stored, largest = wheel_momenta(robot, q, v)
-    np.testing.assert_allclose(axes @ stored, expected, atol=1e-12)
-    assert largest.tolist() == [1.0, np.inf]
-    found = wheel_momentum(robot, q, v)
+    found = wheels_at(robot, q, v)
     np.testing.assert_allclose(found.total, expected, atol=1e-12)
     assert found.axes == 2 and found.least is None
     assert "only two" in str(found)
     three = [fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0) for x in np.eye(3).tolist()]
-    report = str(wheel_momentum(fflin.load("cubesat", inputs=three), *2 * [np.zeros(13)]))
+    cubesat = fflin.load("cubesat", inputs=three)
+    report = str(wheels_at(cubesat, cubesat.neutral(), np.zeros(cubesat.nv)))
     assert "three axes" in report and "least 0.003 N m s" in report
+    unlimited = cubesat.replace(inputs=[*three[:2], replace(three[2], max_speed=None)])
+    assert wheels_at(unlimited, cubesat.neutral(), np.zeros(cubesat.nv)).least is None
 
 
 @pytest.mark.parametrize("name", ["cubesat", "planar_detumble", "dual_arm"])

@@ -7,11 +7,11 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.optimal.plan_search import StageQP
+from fflin.control.optimal import plan_search
 from fflin.control.optimal.shooting import Shooting
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
-from tests.support.speeds import largest_speeds
+from tests.support.speeds import between_knots, largest_speeds
 
 
 def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
@@ -176,12 +176,7 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     # The same again, to the last bit.
     again = fflin.plan(robot, (goal, None), 10.0, v0=v0, **options)
     assert (again.u == motion.u).all() and (again.q == motion.q).all()
-    parts, largest = 64, 0.0
-    for k in range(knots - 1):
-        q, v = motion.q[k], motion.v[k]
-        for part in range(parts):
-            q, v = motion.end(k, 1, q, v, (part / parts, (part + 1) / parts))
-            largest = max(largest, abs(v[6]))
+    largest = largest_speeds(motion)[0]
     assert 0.97 * limit < largest <= 1.01 * limit
     assert missed(robot, motion, goal) < 1e-6
     said = " ".join(str(motion).split())
@@ -200,11 +195,8 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     found = re.search(
         r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split())
     )
-    fine = [
-        motion.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
-        for k in range(5)
-        for part in range(1, 17)
-    ]
+    ends = [[v[6] for _, v in between_knots(motion, k, 128)] for k in range(5)]
+    fine = np.ravel(ends)[7::8]
     assert found and float(found[1]) > 3.0
     assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
@@ -236,8 +228,8 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
 @pytest.mark.parametrize("duration", [3.0, 5.0])
 def test_an_infeasible_plan_gives_up_and_names_the_limit(one_joint, monkeypatch, duration):
     """A joint needs 1 rad / (0.13 rad/s) = 7.7 s; the search stops after ten iterations in vain."""
-    solved, solve = [], StageQP.solve
-    monkeypatch.setattr(StageQP, "solve", lambda qp: solved.append(len(qp.rows.k)) or solve(qp))
+    solved, solve = [], plan_search.solve_stages
+    monkeypatch.setattr(plan_search, "solve_stages", lambda *qp: solved.append(1) or solve(*qp))
     robot, goal = one_joint
     with any_wording(), pytest.raises(fflin.InputError, match=r"joint_1.*longer duration"):
         fflin.plan(robot, (goal, None), duration, knots=21, limits=SPEEDS)
@@ -337,8 +329,9 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
     q, v = shooting.flown((q[0], v[0]), u)
-    A, B, D, inside = shooting.jacobians(q, v, u, 4)
-    h, nx = 1e-5, A.shape[1]
+    ends_by, inside = shooting.jacobians(q, v, u, 4)
+    h, (_, nx, _) = 1e-5, ends_by.shape
+    A, B, D = np.split(ends_by, (nx, nx + u.shape[1]), axis=2)
 
     def ends(z, du):
         knots = shooting.moved(q, v, z)
@@ -400,8 +393,9 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
-    A, B, *_ = shooting.jacobians(motion.q, motion.v, motion.u)
-    size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
+    nx = shooting.state.nx
+    A, B, _ = np.split(shooting.jacobians(motion.q, motion.v, motion.u)[0], (nx, nx + 6), axis=2)
+    size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(nx), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)
         reach = reach @ A[k]

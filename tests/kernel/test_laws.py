@@ -13,8 +13,11 @@ from fflin.kernel.loop import Pulses, StopConditions, Wheels, goes_on
 DT, SAMPLE = 0.1, 4
 
 
-def acting(limits, commands, delay=0, nu=None, initial=None):
-    """The inputs (steps, nu) that act in each step; `nu` is what the rates make of them."""
+def acting(limits, commands, delay=0, nu=None, initial=None, channels=None):
+    """The inputs (steps, nu) that act in each step; `nu` is what the rates make of them.
+
+    The channel is appended to `channels`.
+    """
     size = commands.shape[1]
     channel = channel_of(limits, np.zeros(size) if initial is None else initial, SAMPLE, delay)
     rows = []
@@ -22,6 +25,8 @@ def acting(limits, commands, delay=0, nu=None, initial=None):
         u = commands[step // SAMPLE].copy()
         rules.transmit(channel, step, np.zeros(size) if nu is None else nu(rows), u)
         rows.append(u)
+    if channels is not None:
+        channels.append(channel)
     return np.array(rows)
 
 
@@ -55,11 +60,11 @@ def test_pulses_fire_the_impulse_of_the_commands_but_for_what_is_left(on_off):
     )
     limits = Saturation(np.zeros(1), np.array([most]))._replace(pulses=pulses)
     commands = rng.uniform(0.0, 1.0, size=(40, 1))
-    u = acting(limits, commands)[:, 0]
+    u = acting(limits, commands, channels=(channels := []))[:, 0]
     wanted = SAMPLE * DT * commands[:, 0].cumsum()
     fired = DT * u.cumsum()[SAMPLE - 1 :: SAMPLE]
     # Nothing is lost or made: what is not fired yet is left, at most a pulse of it.
-    assert pulses.left[0] == pytest.approx(wanted[-1] - fired[-1], abs=1e-12)
+    assert channels[0].pulses.left[0] == pytest.approx(wanted[-1] - fired[-1], abs=1e-12)
     assert np.abs(wanted - fired).max() <= max(least, 0.5 * quantum) + 1e-12
     of_samples = DT * u.reshape(-1, SAMPLE).sum(axis=1)
     assert ((of_samples == 0.0) | (of_samples >= least - 1e-12)).all() and (of_samples > 0.0).any()

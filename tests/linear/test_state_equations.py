@@ -52,7 +52,7 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
     own = AccelerationDerivatives(
         rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity
     )
-    f0 = assemble(state, actuation, chart, nu, u, own, A, moving=moving)
+    f0 = assemble(actuation, chart, nu, u, own, A, moving=moving)
     return A, own.by_u, f0
 
 

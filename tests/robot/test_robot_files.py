@@ -301,7 +301,7 @@ def test_models_of_a_file_are_told_from_those_of_its_urdf(written, tmp_path):
     assert batch[0].weights == robot.weights
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
+@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
 def test_a_regulator_weighs_what_the_robot_says(written, tmp_path, ending):
     robot = fflin.load(written(AT_REST))
     lin = fflin.linearize(robot)

@@ -9,6 +9,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
+from fflin.view.page import Page
 from fflin.view.pages import mode_page
 from fflin.view.panel import panel
 from fflin.view.scene import body_poses
@@ -17,7 +18,7 @@ from fflin.view.shapes import shapes
 
 def posed(robot, q):
     """Return the placements in the world of the shapes of a robot at q."""
-    poses = body_poses(robot, robot.create_data(), q)
+    poses = body_poses(robot, q)
     return [
         pin.XYZQUATToSE3(poses[shape.joint - ROOT]) * shape.placement for shape in shapes(robot)[0]
     ]
@@ -83,7 +84,7 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
 def test_the_page_of_modes_plays_the_arrays():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
     found = fflin.modes(fflin.linearize(robot))
-    page, notes = mode_page(robot, found, scene="space", tool=None)
+    page, notes = mode_page(Page(robot, "space", None, found.lin.frame), found)
     assert not notes
     packed = re.findall(r'"poses":"([^"]+)"', page)
     assert len(packed) == len(found.vibrations)

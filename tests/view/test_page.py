@@ -11,7 +11,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.visualize import default_tool
+from fflin.view.visualize import tool_frame
 from tests.support.browser import Watched
 from tests.support.motions import HOME, led, settling
 
@@ -508,7 +508,7 @@ def middle_of(watched, *path, mesh):
 def test_the_paths_of_the_reference_are_dashed_beside_those_flown(led_page):
     robot, motion, watched, _ = led_page
     state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
-    data, tool = robot.model.createData(), robot.model.getFrameId(default_tool(robot))
+    data, tool = robot.model.createData(), robot.model.getFrameId(tool_frame(robot))
 
     def course(q):
         ends = []

@@ -5,9 +5,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT
-from fflin.view.page import thrusters
-from fflin.view.pages import play_back
+from fflin.view.page import Page
+from fflin.view.pages import moved, play_back
 from tests.support.robots import random_point, random_pose
 
 FRAMES = ("hybrid", "local", "world")
@@ -23,7 +24,7 @@ def test_arrows_are_the_wrench_that_acts_on_the_base(robots, frame):
     reference = random_pose(rng, 40.0)
     u = rng.normal(size=6)
     state = fflin.StateMap(robot, reference=reference, frame=frame)
-    film = play_back(robot, state, q[None], u[None], "tool")
+    film = play_back(state, q[None], u[None])
     lin = fflin.linearize(robot, q, np.zeros(robot.nv), u, frame=frame, reference=reference)
     # f0 has the accelerations of the base: d omega/dt and d v/dt in the frame's axes.
     base = pin.XYZQUATToSE3(film.poses[0, 0])
@@ -59,17 +60,19 @@ def test_the_centre_of_mass_moves_straight_when_nothing_pushes(robots):
     count = len(qs)
     u = np.zeros((count, 6 + robot.n))
     state = fflin.StateMap(robot)
-    film = play_back(robot, state, np.array(qs), u, "tool")
+    film = play_back(state, np.array(qs), u)
     way = film.com - film.com[0]
     direction = way[-1] / np.linalg.norm(way[-1])
     off = way - np.outer(way @ direction, direction)
     assert np.abs(off).max() < 1e-6 < 1e-3 < np.linalg.norm(way[-1])
-    bend = film.tool - film.tool[0]
+    joint, at = find_frame(model, "tool")
+    tools = moved(film.poses[:, joint - ROOT], at.translation)
+    bend = tools - tools[0]
     bend -= np.outer(bend @ bend[-1], bend[-1]) / (bend[-1] @ bend[-1])
     assert np.abs(bend).max() > 1e-4  # which the tool does not
     pin.framesForwardKinematics(model, data, qs[-1])
     tool = data.oMf[model.getFrameId("tool")].translation
-    np.testing.assert_allclose(film.tool[-1], tool, atol=1e-12)
+    np.testing.assert_allclose(tools[-1], tool, atol=1e-12)
     for index, pose in enumerate(film.poses[-1]):
         assert pin.XYZQUATToSE3(pose).isApprox(data.oMi[ROOT + index], 1e-12)
 
@@ -79,13 +82,16 @@ def test_plumes_stand_where_thrusters_push(robots):
     robot = robots["servicer_7dof"].replace(inputs=[fflin.JointTorque("joint_1"), thruster])
     rng = np.random.default_rng(1)
     q, _, u = random_point(robots["servicer_7dof"], rng)
-    ((name, joint, position, direction),) = thrusters(robot)
+    (nozzle,) = Page(robot, "space", None, None).nozzles
+    name, path, position, direction = (nozzle[k] for k in ("name", "path", "position", "direction"))
     assert name == fflin.linearize(robot).input_names[1]
+    joint = robot.model.getJointId(path[-1])
+    position, direction = np.array(position), np.array(direction)
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, q)
     tool = data.oMf[robot.model.getFrameId("tool")]
     np.testing.assert_allclose(data.oMi[joint].act(position), tool.act(np.array([0.1, -0.2, 0.3])))
     np.testing.assert_allclose(data.oMi[joint].rotation @ direction, tool.rotation @ [0, 0.6, 0.8])
     state = fflin.StateMap(robot)
-    film = play_back(robot, state, q[None], u[None, :2], "tool")
+    film = play_back(state, q[None], u[None, :2])
     assert film.thrust.tolist() == [[u[1]]]

@@ -15,7 +15,7 @@ import pytest
 import fflin
 from fflin.commands.cli import main
 from fflin.view.pages import frame_indices
-from fflin.view.visualize import default_tool
+from fflin.view.visualize import tool_frame
 from tests.support.messages import hear_lines, says
 from tests.support.motions import settling
 from tests.support.patience import finished
@@ -91,12 +91,12 @@ def test_frames_are_samples_of_the_motion():
 
 
 def test_the_tool_is_the_end_of_the_longest_chain(robots):
-    assert default_tool(robots["servicer_7dof"]) == "tool"
-    assert default_tool(robots["cubesat"]) is None
+    assert tool_frame(robots["servicer_7dof"]) == "tool"
+    assert tool_frame(robots["cubesat"]) is None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         panda = fflin.load("panda", lock=["panda_finger_joint1"])
-    name = default_tool(panda)
+    name = tool_frame(panda)
     assert panda.model.frames[panda.model.getFrameId(name)].parentJoint == panda.model.njoints - 1
 
 

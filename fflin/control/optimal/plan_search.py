@@ -1,7 +1,5 @@
 """Search for a plan by sequential quadratic programming with multiple shooting."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -79,6 +77,7 @@ class Search(NamedTuple):
     asked: Mask  # states whose value at the end is prescribed (nx,)
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
+    size: Array  # magnitudes of the limits of states (nx,), 0 for states without limits
     cost: Array  # weights of squared inputs (N + 1, nu)
     parts: int  # number of parts per interval, at whose ends states are limited
     report: Callable[[str], None]  # receives a line of text in each iteration
@@ -132,12 +131,6 @@ class Search(NamedTuple):
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
         self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
 
-    @property
-    def _size(self) -> Array:
-        """Magnitudes of the limits of states (nx,), or zero for states without limits."""
-        size: Array = np.abs(np.where(np.isfinite(self.bounds), self.bounds, 0.0)).max(axis=0)
-        return size
-
     def _trial(self, q: Array, v: Array, u: Array) -> Trial:
         shooting = self.shooting
         motions = shooting.motions(q, v, u)
@@ -145,13 +138,13 @@ class Search(NamedTuple):
         knots[0, 0], knots[1, 0] = -np.inf, np.inf
         to_end = shooting.between((q[-1], v[-1]), self.end)
         knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
-        tighter = self.bounds + _TIGHTER * np.array((self._size, -self._size))
+        tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
         """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
-        beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self._size
+        beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self.size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
         near[:, :-1] |= beyond[:, 1:]
@@ -168,25 +161,22 @@ class Search(NamedTuple):
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
-            A, B, D, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
+            ends, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
         except InputError:  # the motion has diverged
             return None
         k, part, state = np.nonzero(limited)
-        least, largest = trial.inside[:, k, part, state]
-        rows = StageRows(k, inside[k, part, state], least, largest, _PRICE)
-        low, high = np.concatenate((trial.knots, self.limits[:, None] - u), axis=2)
+        rows = StageRows(k, inside[k, part, state], trial.inside[:, k, part, state], _PRICE)
+        limits = np.concatenate((trial.knots, self.limits[:, None] - u), axis=2)
         weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
         H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
         g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
-        found = StageQP(
-            np.zeros(nx), A, B, D, trial.missed, H, g, low, high, soft, rows, scale
-        ).solve()
+        found = solve_stages(ends, trial.missed, H, g, limits, soft, rows, scale)
         if found is None:
             return None
-        left = np.array((rows.low, rows.high)) - rows.values(found.x, found.u)
-        at_knots = float(excess(trial.knots - found.x).sum())
-        return *found, at_knots + float(excess(left).sum()), at_knots
+        z, du, _ = found
+        at_knots = float(excess(trial.knots - z).sum())
+        return *found, at_knots + float(excess(rows.limits - rows.values(z, du)).sum()), at_knots
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals by the smallest changes, if possible.
@@ -235,16 +225,6 @@ def _stagnates(left: list[float]) -> bool:
     return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
 
-def cost_of_inputs(shooting: Shooting, R: Array, u: Array) -> Array:
-    """Return the cost of squared inputs (N + 1, nu), scaled so that the guess costs 1."""
-    h = shooting.h
-    # Weights of the knots in the integral: the trapezoidal rule, or the hold time of each input.
-    held = np.append(h, h[-1]) if shooting.held else 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
-    cost = held[:, None] * R
-    cost /= (cost * u * u).sum() or cost.sum()
-    return cost
-
-
 def excess(room: Array) -> Array:
     """Return by how much points exceed limits; `room` is how far they may move down and up."""
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)
@@ -254,21 +234,12 @@ def excess(room: Array) -> Array:
 _ACCURACY = 1e-10
 
 
-class StageSolution(NamedTuple):
-    """Optimal states and inputs, and the multipliers of the equality constraints."""
-
-    x: Array  # (N + 1, nx)
-    u: Array  # (N + 1, nu)
-    y: Array  # (N, nx), multipliers of A x + B u + D u[k + 1] + c - x[k + 1] = 0
-
-
 class StageRows(NamedTuple):
     """Soft limits low - s <= G (x[k], u[k], u[k + 1]) <= high + s of linear combinations."""
 
     k: Indices  # (m,)
     G: Array  # (m, nx + 2 nu)
-    low: Array  # (m,)
-    high: Array
+    limits: Array  # low and high (2, m)
     soft: float  # cost of a unit of s
 
     def values(self, x: Array, u: Array) -> Array:
@@ -278,80 +249,81 @@ class StageRows(NamedTuple):
         return values
 
 
-class StageQP(NamedTuple):
-    r"""Quadratic program in w = (x, u) over N stages, with bounds on every variable.
+def solve_stages(
+    ends: Array,
+    c: Array,
+    H: Array,
+    g: Array,
+    limits: Array,
+    soft: Array,
+    rows: StageRows,
+    scale: Array,
+) -> tuple[Array, Array, Array] | None:
+    r"""Solve a quadratic program in w = (x, u) over N stages, with bounds on every variable.
 
     .. math::
         \min \sum_{k=0}^N \tfrac12 w_k^T H_k w_k + g_k^T w_k + \mathrm{soft}_k^T s_k, \quad
-        x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad
+        x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad x_0 = 0, \quad
         \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0
 
-    The soft limits of `rows` are further constraints.
+    The soft limits of `rows` are further constraints. The program is scaled by typical sizes
+    `scale` (nx + nu,) of the variables. `ends` (N, nx, nx + 2 nu) contains A, B and D side by side;
+    D is zero if inputs are held. `H` (N + 1, nx + nu, nx + nu) is positive semidefinite. `limits`
+    (2, N + 1, nx + nu) are low and high, and g and soft have one row for each knot.
+
+    Returns x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints, or
+    None if the program is infeasible or the solver fails.
     """
+    import scipy.sparse as sp
 
-    start: Array  # x[0] (nx,)
-    A: Array  # (N, nx, nx)
-    B: Array  # (N, nx, nu)
-    D: Array  # (N, nx, nu), zero if inputs are held
-    c: Array  # (N, nx)
-    H: Array  # (N + 1, nx + nu, nx + nu), positive semidefinite
-    g: Array  # (N + 1, nx + nu)
-    low: Array  # (N + 1, nx + nu)
-    high: Array
-    soft: Array  # (N + 1, nx + nu)
-    rows: StageRows
-    scale: Array  # (nx + nu,), typical sizes of the variables, which scale the program
-
-    def solve(self) -> StageSolution | None:
-        """Return the solution, or None if the program is infeasible or the solver fails."""
-        import scipy.sparse as sp
-
-        piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
-        (N, nx, nu), (knots, nw) = self.B.shape, self.g.shape
-        size, of_rows = np.tile(self.scale, knots), 1.0 / np.tile(self.scale[:nx], knots)
-        none = sp.csc_array((N * nx, nw))
-        ends = np.concatenate((np.tile(-np.eye(nx), (N, 1, 1)), self.D), axis=2)
-        links = sp.hstack((sp.block_diag(np.concatenate((self.A, self.B), axis=2)), none))
-        links = links + sp.hstack((none, sp.block_diag(ends)))
-        first = sp.eye_array(nx, knots * nw)
-        E = sp.diags_array(of_rows) @ sp.vstack((first, links)) @ sp.diags_array(size)
-        H = self.scale[:, None] * self.H * self.scale
-        cost = np.abs(H).max() or 1.0
-        low, high = (each.ravel() / size for each in (self.low, self.high))
-        prices = self.soft.ravel() * size
-        at = np.flatnonzero(np.isfinite(prices) & (np.isfinite(low) | np.isfinite(high)))
-        picked = sp.eye_array(knots * nw, format="csr")[at]
-        columns = self.rows.k[:, None] * nw + np.append(np.arange(nw), nw + nx + np.arange(nu))
-        starts = np.arange(len(columns) + 1) * (nw + nu)
-        combined = sp.csr_array(
-            (self.rows.G.ravel() * size[columns.ravel()], columns.ravel(), starts),
-            (len(columns), knots * nw),
-        )
-        # Each soft limit has a slack s: w + s >= low, w - s <= high.
-        limited = sp.vstack((picked, combined))
-        least = np.concatenate((low[at], self.rows.low))
-        largest = np.concatenate((high[at], self.rows.high))
-        prices = np.concatenate((prices[at], np.full(len(columns), self.rows.soft)))
-        low[at], high[at] = -np.inf, np.inf
-        k, open_ = len(least), np.full(len(least), np.inf)
-        slack = sp.eye_array(k)
-        G = sp.vstack((sp.hstack((limited, slack)), sp.hstack((limited, -slack))), format="csc")
-        of_G = np.concatenate((least, -open_)), np.concatenate((open_, largest))
-        solver = piqp.SparseSolver()
-        for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
-            setattr(solver.settings, name, _ACCURACY)
-        solver.setup(
-            sp.block_diag((*(H / cost), sp.csc_array((k, k))), format="csc"),
-            np.concatenate((self.g.ravel() * size, prices)) / cost,
-            sp.hstack((E, sp.csc_array((E.shape[0], k))), format="csc"),
-            of_rows * np.concatenate((self.start, -self.c.ravel())),
-            *((G, *of_G) if k else (None, None, None)),
-            np.concatenate((low, np.zeros(k))),
-            np.concatenate((high, open_)),
-        )
-        if solver.solve() != piqp.PIQP_SOLVED:
-            return None
-        found = solver.result
-        w = (found.x[: len(size)] * size).reshape(knots, nw)
-        y = (cost * of_rows * found.y).reshape(knots, nx)[1:]
-        return StageSolution(w[:, :nx], np.clip(w, self.low, self.high)[:, nx:], y)
+    piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
+    (N, nx, _), (knots, nw) = ends.shape, g.shape
+    size, of_rows = np.tile(scale, knots), 1.0 / np.tile(scale[:nx], knots)
+    none = sp.csc_array((N * nx, nw))
+    after = np.concatenate((np.tile(-np.eye(nx), (N, 1, 1)), ends[:, :, nw:]), axis=2)
+    links = sp.hstack((sp.block_diag(ends[:, :, :nw]), none))
+    links = links + sp.hstack((none, sp.block_diag(after)))
+    first = sp.eye_array(nx, knots * nw)
+    E = sp.diags_array(of_rows) @ sp.vstack((first, links)) @ sp.diags_array(size)
+    H = scale[:, None] * H * scale
+    cost = np.abs(H).max() or 1.0
+    low, high = limits.reshape(2, -1) / size
+    prices = soft.ravel() * size
+    at = np.flatnonzero(np.isfinite(prices) & (np.isfinite(low) | np.isfinite(high)))
+    picked = sp.eye_array(knots * nw, format="csr")[at]
+    columns = rows.k[:, None] * nw + np.append(np.arange(nw), nx + np.arange(nw, 2 * nw - nx))
+    combined = sp.csr_array(
+        (
+            rows.G.ravel() * size[columns.ravel()],
+            columns.ravel(),
+            np.arange(len(columns) + 1) * rows.G.shape[1],
+        ),
+        (len(columns), knots * nw),
+    )
+    # Each soft limit has a slack s: w + s >= low, w - s <= high.
+    limited = sp.vstack((picked, combined))
+    least, largest = np.hstack(((low[at], high[at]), rows.limits))
+    prices = np.concatenate((prices[at], np.full(len(columns), rows.soft)))
+    low[at], high[at] = -np.inf, np.inf
+    k, open_ = len(least), np.full(len(least), np.inf)
+    slack = sp.eye_array(k)
+    G = sp.vstack((sp.hstack((limited, slack)), sp.hstack((limited, -slack))), format="csc")
+    of_G = np.concatenate((least, -open_)), np.concatenate((open_, largest))
+    solver = piqp.SparseSolver()
+    for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
+        setattr(solver.settings, name, _ACCURACY)
+    solver.setup(
+        sp.block_diag((*(H / cost), sp.csc_array((k, k))), format="csc"),
+        np.concatenate((g.ravel() * size, prices)) / cost,
+        sp.hstack((E, sp.csc_array((E.shape[0], k))), format="csc"),
+        of_rows * np.append(np.zeros(nx), -c),
+        *((G, *of_G) if k else (None, None, None)),
+        np.concatenate((low, np.zeros(k))),
+        np.concatenate((high, open_)),
+    )
+    if solver.solve() != piqp.PIQP_SOLVED:
+        return None
+    found = solver.result
+    w = (found.x[: len(size)] * size).reshape(knots, nw)
+    y = (cost * of_rows * found.y).reshape(knots, nx)[1:]
+    return w[:, :nx], np.clip(w, *limits)[:, nx:], y

@@ -31,18 +31,26 @@ _NEAR_BOUNDARY = 1e-6
 
 
 class Solution(NamedTuple):
-    """Solution of a Riccati equation: P, K, the poles of A - B K, residual and method."""
+    """Solution of a Riccati equation: P, K, the sorted poles of A - B K, residual and method.
+
+    The margin is the distance of the poles from the stability boundary.
+    """
 
     P: Array
     K: Array
     poles: Values
     residual: float
     method: str
+    margin: float
 
-    def ordered(self, dt: float) -> tuple[Values, float]:
-        """Return the sorted poles, and their distance from the stability boundary."""
-        poles = self.poles[np.lexsort((self.poles.imag, self.poles.real))]
-        return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
+
+def solved(
+    P: Array, K: Array, poles: Values, residual: float, method: str, *, discrete: bool = False
+) -> Solution:
+    """Return a solution with sorted poles and their margin."""
+    poles = poles[np.lexsort((poles.imag, poles.real))]
+    margin = float(1.0 - np.abs(poles).max() if discrete else -poles.real.max())
+    return Solution(P, K, poles, residual, method, margin)
 
 
 def rates_of(poles: Values, dt: float) -> Values:
@@ -141,9 +149,8 @@ def half_size(
     found = _half_size(Riccati(A, B, Q, R, N, dt))
     if found is None or found.residual > _SOUND:
         return None
-    decay = 1.0 - np.abs(found.poles) if dt else -found.poles.real
     size = np.abs(found.poles - 1.0 if dt else found.poles).max()
-    return found if decay.min() >= _NEAR_BOUNDARY * size else None
+    return found if found.margin >= _NEAR_BOUNDARY * size else None
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
@@ -164,9 +171,10 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
         loop = second_order_loop(A, source.B, Q, source.R_factor)
         if loop is None:
             return None
-        P = loop.modes.lyapunov_modal(loop.cost)
-        modes = None if equation.discrete else loop.modes
-        found = _finished(equation, *_refined(equation, P, modes), "structured")
+        modes, cost = loop
+        P = modes.lyapunov_modal(cost)
+        refined = _refined(equation, P, None if equation.discrete else modes)
+        found = _finished(equation, *refined, "structured")
     if apart or (found is not None and found.residual <= _SOUND):
         return found
     # If modes coincide, as in critical damping, V is singular. Newton's method then starts from a
@@ -196,8 +204,8 @@ def _finished(
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
     poles = modes.poles(F) if modes else np.linalg.eigvals(F)
-    stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
-    return Solution(trial.P, K, poles, trial.residual, method) if stable else None
+    found = solved(trial.P, K, poles, trial.residual, method, discrete=equation.discrete)
+    return found if found.margin > 0.0 else None
 
 
 def _refined(
@@ -293,15 +301,13 @@ class ModalMatrix:
         return values
 
 
-class OptimalLoop(NamedTuple):
-    """Modes V of a closed loop, and the cost V^H (Q + K' R K) V of its gain."""
+def second_order_loop(
+    A: Array, B: Array, Q: Array, R_factor: Array
+) -> tuple[ModalMatrix, Values] | None:
+    """Return a loop that is optimal if odd powers (10.5) are neglected, or None if impossible.
 
-    modes: ModalMatrix
-    cost: Values
-
-
-def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    """Return a loop that is optimal if odd powers (10.5) are neglected, or None if impossible."""
+    The loop is described by its modes V and the cost V^H (Q + K' R K) V of its gain.
+    """
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
@@ -314,7 +320,11 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     sizes = np.abs(Ls.diagonal())
     singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
-    inverse = _inverse(A12)
+    diagonal = A12.diagonal()
+    if np.count_nonzero(A12) == np.count_nonzero(diagonal):
+        inverse = np.diag(1.0 / diagonal) if diagonal.all() else None
+    else:
+        inverse = np.linalg.inv(A12) if np.linalg.cond(A12) <= 1e8 else None
     if singular or inverse is None:
         return None
     # x = T (p, dp/dt)
@@ -342,17 +352,8 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     if not plain:
         a = a - F @ motion[:m] - H @ motion[m:]
     cost = motion.conj().T @ weight @ motion + a.conj().T @ a
-    return OptimalLoop(ModalMatrix(T @ motion, poles, discrete=False), cost)
+    return ModalMatrix(T @ motion, poles, discrete=False), cost
 
 
 def _lower(factor: Array, right: Array) -> Array:
     return dtrtrs(factor, right, lower=1)[0]
-
-
-def _inverse(A12: Array) -> Array | None:
-    diagonal = A12.diagonal()
-    if np.count_nonzero(A12) == np.count_nonzero(diagonal):
-        return np.diag(1.0 / diagonal) if diagonal.all() else None
-    if np.linalg.cond(A12) > 1e8:
-        return None
-    return np.linalg.inv(A12)

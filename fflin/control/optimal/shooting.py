@@ -137,13 +137,12 @@ class Shooting:
             if np.abs(missed - before).max() <= accuracy:
                 break
 
-    def jacobians(
-        self, q: Array, v: Array, u: Array, parts: int = 1
-    ) -> tuple[Array, Array, Array, Array]:
+    def jacobians(self, q: Array, v: Array, u: Array, parts: int = 1) -> tuple[Array, Array]:
         """Return Jacobians of interval ends with respect to z and the inputs at both knots.
 
-        The last array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians, side by side, of the
-        points between the equal parts of the intervals.
+        The first array (N, nx, nx + 2 nu) contains the Jacobians side by side. The second array
+        (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of the points between the equal parts
+        of the intervals.
         """
         # Runge-Kutta steps of dZ/dt = A Z + B along the motions, for all intervals at once.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
@@ -174,8 +173,7 @@ class Shooting:
             within = (fractions >= step) & (fractions < step + 1)
             powers = (fractions[within] - step)[:, None] ** np.arange(4)
             inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
-        A, B, D = np.split(Z, (nx, nx + nu), axis=2)
-        return A, B, D, np.concatenate(inside, axis=1)
+        return Z, np.concatenate(inside, axis=1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots on cubics between two points, and approximate inputs for them."""

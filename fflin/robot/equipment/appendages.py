@@ -87,7 +87,8 @@ class FlexibleAppendage(FrozenArrays):
     rigid: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        what = _title("flexible appendage", self.frame, self.name)
+        _check_names(self.frame, self.name)
+        what = f"flexible appendage '{self.frame}'"
         frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
         damping, modes = as_double(f"damping of {what}", self.damping), frequency.size
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
@@ -285,7 +286,8 @@ class Slosh:
     name: str | None = None
 
     def __post_init__(self) -> None:
-        what = _title("slosh", self.frame, self.name)
+        _check_names(self.frame, self.name)
+        what = f"slosh '{self.frame if self.name is None else self.name}'"
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
@@ -449,11 +451,8 @@ def rigid_inertia(M: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(entries)
 
 
-def _title(kind: str, frame: object, name: object) -> str:
-    """Return what messages call an appendage, or raise `InputError` for an invalid name."""
+def _check_names(frame: object, name: object) -> None:
     for what, value in {"frame": frame, **({} if name is None else {"name": name})}.items():
         printable = isinstance(value, str) and value.strip() and value.isprintable()
         if not printable or (what == "name" and set(str(value)) & set("*?[]")):
-            said = f"{what} of an appendage is {value!r}, expected a name without *?[]"
-            raise InputError(said)
-    return f"{kind} '{frame if name is None else name}'"
+            raise InputError(f"{what} of an appendage is {value!r}, expected a name without *?[]")

@@ -84,17 +84,15 @@ def equipped(
     items = robot.appendages if appendages is None else tuple(appendages)
     parts += _mounted_modes(bare, bodies, items)
     if parts:
-        taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
+        taken = [*{*model.names, *(frame.name for frame in model.frames.tolist())}]
+        taken += [part.name for part in parts]
         for part in parts:
-            if part.name in taken:
+            if taken.count(part.name) > 1:
                 raise InputError(
                     f"'{part.name}' has the name of another joint, frame, wheel or mode of the "
                     "robot; give the wheel or the appendage another name"
                 )
-            taken.add(part.name)
         model = with_mounted(model, bodies, parts)
-        for part in parts:
-            model.addJointFrame(model.getJointId(part.name))
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(each.within(model) for each in followers)

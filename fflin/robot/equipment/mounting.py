@@ -1,7 +1,9 @@
 """Wheels and other bodies on new joints, subtracted from the links whose inertia includes them."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,14 +14,8 @@ from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.urdf.description import is_impossible
 
-# Arrays of a Pinocchio model: first those with an entry for each entry of v, then for each entry
-# of q.
-_OF_VELOCITY = (
-    *("armature", "damping", "rotorInertia", "rotorGearRatio"),
-    *("lowerEffortLimit", "upperEffortLimit", "lowerVelocityLimit", "upperVelocityLimit"),
-    *("lowerDryFrictionLimit", "upperDryFrictionLimit"),
-)
-_OF_POSITION = ("lowerPositionLimit", "upperPositionLimit", "positionLimitMargin")
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
 
 
 class Mounted(NamedTuple):
@@ -45,55 +41,37 @@ class Mounted(NamedTuple):
 def with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
     """Return a model with a new joint for each part, and with new inertias of the old bodies.
 
-    The new joints have no frames yet.
+    The new joints come after all other joints that their carrier carries.
     """
-    on: dict[int | str, list[Mounted]] = {}
+    new = model.copy()
     for part in parts:
-        on.setdefault(part.carrier, []).append(part)
-    new = pin.Model()
-    new.name, new.gravity = model.name, model.gravity
-    moved, added = {0: 0}, dict[int | str, int]()
-    # CRBA needs the joints in depth-first order; mounted bodies come after a joint's other joints.
-    left: list[int | Mounted] = [ROOT]
-    while left:
-        item = left.pop()
-        if isinstance(item, Mounted):
-            key: int | str = item.name
-            index = new.addJoint(added[item.carrier], item.motion, item.placement, item.name)
-            body, children = item.inertia, []
-        else:
-            key, parent, placement = item, moved[model.parents[item]], model.jointPlacements[item]
-            index = new.addJoint(parent, model.joints[item], placement, model.names[item])
-            body, children, moved[item] = bodies[item], model.children[item].tolist(), index
-        added[key] = index
-        left += [*reversed(on.get(key, [])), *reversed(children)]
-        # The body is not passed to appendBodyToJoint, which divides by its mass (perhaps zero).
-        new.appendBodyToJoint(index, pin.Inertia.Zero(), pin.SE3.Identity())
-        new.inertias[index] = body
-    carry_over(model, new, moved)
-    armature = new.armature.copy()
+        on = part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
+        # Models built in code may lack frames of their joints.
+        if not new.existFrame(on, pin.FrameType.JOINT):
+            new.addJointFrame(new.getJointId(on))
+        alone = pin.Model()
+        alone.addJoint(0, part.motion, pin.SE3.Identity(), part.name)
+        alone.addJointFrame(1)
+        new = pin.appendModel(new, alone, new.getFrameId(on, pin.FrameType.JOINT), part.placement)
+    carry_over(model, new)
+    for name, body in zip(model.names, bodies, strict=True):
+        new.inertias[new.getJointId(name)] = body
+    new.name, new.gravity, armature = model.name, model.gravity, new.armature.copy()
     for part in parts:
-        armature[new.idx_vs[added[part.name]]] = part.armature
+        index = new.getJointId(part.name)
+        new.inertias[index], armature[new.idx_vs[index]] = part.inertia, part.armature
     new.armature = armature
-    # Frames refer to their parent frames by index. So old frames keep their order, and new frames
-    # come last.
-    for frame in model.frames.tolist()[1:]:
-        copy = pin.Frame(frame)
-        copy.parentJoint = moved[frame.parentJoint]
-        new.addFrame(copy, False)
     return new
 
 
-def carry_over(model: pin.Model, new: pin.Model, moved: Mapping[int, int]) -> None:
-    """Copy armatures, limits and similar arrays of joints; `moved` is {old index: new index}."""
-    for names, begin, length in (_OF_VELOCITY, "idx_vs", "nvs"), (_OF_POSITION, "idx_qs", "nqs"):
-        sizes, old_at, new_at = getattr(model, length), getattr(model, begin), getattr(new, begin)
-        for name in names:
-            values, old = getattr(new, name).copy(), getattr(model, name)
-            for index, to in moved.items():
-                size = sizes[index]
-                values[new_at[to] : new_at[to] + size] = old[old_at[index] : old_at[index] + size]
-            setattr(new, name, values)
+def carry_over(model: pin.Model, new: pin.Model) -> None:
+    """Copy the arrays of joints that `appendModel` leaves out from a model to the new model."""
+    for name in ("armature", "lowerVelocityLimit"):
+        values, old = getattr(new, name).copy(), getattr(model, name)
+        for index in range(ROOT, model.njoints):
+            at, size = new.idx_vs[new.getJointId(model.names[index])], model.nvs[index]
+            values[at : at + size] = old[model.idx_vs[index] :][:size]
+        setattr(new, name, values)
 
 
 def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
@@ -102,12 +80,15 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
     return joint, placement.rotation @ np.array(wheel.axis)
 
 
-def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
-    """Return (joint, momentum (3,) [N m s] in its frame) of the wheels without inertia."""
+def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
+    """Angular momentum stored in the wheels without inertia, by the joint that carries them.
+
+    Each entry is the joint index and the vector (3,) [N m s] in joint axes.
+    """
     stored: dict[int, Array] = {}
-    for _, wheel in named_wheels(inputs):
+    for _, wheel in named_wheels(robot.inputs):
         if wheel.momentum:
-            joint, axis = carrier(model, wheel)
+            joint, axis = carrier(robot.model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
     return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
 

@@ -1,7 +1,5 @@
 """Craig-Bampton superelements of Nastran, with modes that are clamped at a rigid interface."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

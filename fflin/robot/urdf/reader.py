@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import pinocchio as pin
 
@@ -52,11 +52,6 @@ _IGNORED = {
 }
 
 
-# Warning about joints that is dropped if a field of the robot names all of them: the name of the
-# field, the joints and the warning.
-Advice: TypeAlias = tuple[str, tuple[str, ...], str]
-
-
 class Urdf(NamedTuple):
     """Checked content of a robot's file."""
 
@@ -67,7 +62,6 @@ class Urdf(NamedTuple):
     mimics: dict[str, Mimic]  # {mimic joint: Mimic} with independent leaders
     meshes: set[str]  # mesh files as written in the file; they are not read
     notes: tuple[str, ...]  # warnings, one line each
-    advice: tuple[Advice, ...]  # warnings that fields of the robot may make unnecessary
 
 
 def read_urdf(path: Path) -> Urdf:
@@ -118,9 +112,8 @@ def describe(document: bytes, path: Path) -> Urdf:
     model.name = name or path.stem.encode(errors="backslashreplace").decode()
     notes += [*notes_of(root), *inertia_notes(links.values(), model, path.stem)]
     meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
-    advice = tuple(_advice(moving, path.stem))
     digest = hashlib.sha256(document).hexdigest()
-    return Urdf(model, digest, links, joints, mimics, meshes, tuple(notes), advice)
+    return Urdf(model, digest, links, joints, mimics, meshes, tuple(notes))
 
 
 def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
@@ -142,22 +135,27 @@ def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
     return parse(expanded, f"{path} as expanded by xacro"), notes
 
 
-def _advice(moving: list[JointElement], origin: str) -> Iterator[Advice]:
-    """Yield warnings about dampers, friction and zero limits that the model ignores."""
-    damped = tuple(joint.name for joint in moving if joint.damping)
-    rubbing = tuple(joint.name for joint in moving if joint.friction)
-    if damped:
-        yield "damping", damped, f"{origin}: damping unused: {enumerated(damped)}"
-    if rubbing:
-        yield "friction", rubbing, f"{origin}: Coulomb friction unused: {enumerated(rubbing)}"
-    zero = {
-        what: tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
-        for what in ("effort", "velocity")
-    }
-    for joints in dict.fromkeys(filter(None, zero.values())):
-        of = named("joint", joints) if len(joints) < 3 else f"{len(joints)} joints"
-        limits = ", ".join(what for what, names in zero.items() if names == joints)
-        yield "passive", joints, f"{origin}: {limits} 0 of {of}: no limit (or passive)"
+def ignored(
+    joints: Mapping[str, JointElement], origin: str
+) -> Iterator[tuple[str, tuple[str, ...], str]]:
+    """Yield warnings about dampers, friction and zero limits that the model ignores.
+
+    Each warning comes after the name of a field of the robot and the names of joints. The warning
+    is unnecessary if this field names all of these joints.
+    """
+    moving = [joint for joint in joints.values() if joint.freedom]
+    for field, effect in (("damping", "damping"), ("friction", "Coulomb friction")):
+        if names := tuple(joint.name for joint in moving if getattr(joint, field)):
+            yield field, names, f"{origin}: {effect} unused: {enumerated(names)}"
+    zero: dict[tuple[str, ...], list[str]] = {}
+    for limit in ("effort", "velocity"):
+        names = tuple(joint.name for joint in moving if (joint.limits or {}).get(limit) == 0.0)
+        zero.setdefault(names, []).append(limit)
+    for names, limits in zero.items():
+        if names:
+            of = named("joint", names) if len(names) < 3 else f"{len(names)} joints"
+            said = f"{origin}: {', '.join(limits)} 0 of {of}: no limit (or passive)"
+            yield "passive", names, said
 
 
 def write_urdf(

@@ -56,7 +56,7 @@ function makeEquipment(viewer, info) {
     viewer.scene_tree.find([...each.path, name]).object.add(mark);
     if (mark.show) shows.push(mark.show);
   };
-  info.triads.forEach((each, k) => add(each, `frame ${k}`, triad(each)));
+  info.triads.forEach((each, k) => add(each, `frame ${k}`, triad({ ...each, length: (k ? 0.12 : 0.3) * info.size })));
   info.nozzles.forEach((each, k) => add(each, `nozzle ${k}`, nozzle(each, info.size)));
   info.wheels.forEach((each, k) => add(each, `wheel ${k}`, wheel(each, info.size, viewer)));
   return () => shows.forEach((show) => show());

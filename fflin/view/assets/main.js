@@ -27,10 +27,10 @@ function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, paths: [["meshcat", ...path]] });
   if (info.mode === "modes") return [entry("at rest", GHOST, "rest")];
   const entries = [
-    ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
+    ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name }) => entry(`path of the ${name}`, MARKS[name], "trails", name)),
     ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
-    ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
+    ...info.arrows.map(({ kind }) => entry(`${kind} on the base`, MARKS[kind], "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
   const dashed = info.followed.length > 0;
@@ -100,8 +100,9 @@ function main() {
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
   paint(info.plots);
   const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
+  const most = Math.max(...info.plumes.map(({ values }) => largest(values, 1)));
   info.plumes = info.plumes.filter((each) => thrusters.some(({ label }) => label === each.name)); // those that fire
-  for (const each of info.plumes) each.colour = thrusters.find(({ label }) => label === each.name).colour;
+  for (const each of info.plumes) Object.assign(each, { most, colour: thrusters.find(({ label }) => label === each.name).colour });
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);

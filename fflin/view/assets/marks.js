@@ -1,5 +1,18 @@
 // What is drawn about the robot: trails, forces, torques and plumes of thrusters.
 
+const MARKS = { tool: "#ff9d4d", base: "#7fe3c4", "centre of mass": "#7fe3c4", force: "#ffd166", torque: "#d58cff" };
+
+// The largest length of the vectors of `size` entries in an array.
+function largest(values, size) {
+  let square = 0;
+  for (let i = 0; i < values.length; i += size) {
+    let sum = 0;
+    for (let k = i; k < i + size; k++) sum += values[k] * values[k];
+    square = Math.max(square, sum);
+  }
+  return Math.sqrt(square);
+}
+
 function flat(colour) {
   return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
 }
@@ -71,7 +84,8 @@ function trail({ name, points, colour, radius, dashed }) {
   return group;
 }
 
-function forceArrow({ colour, values, most, longest, size }) {
+function forceArrow({ colour, values, longest, size }) {
+  const most = largest(values, 3);
   const group = arrow(colour, 0.010 * size, seenThrough(colour));
   group.show = (i) => {
     const force = new THREE.Vector3().fromArray(values, 3 * i);
@@ -85,7 +99,8 @@ function forceArrow({ colour, values, most, longest, size }) {
 }
 
 // An arrow along the axis with an arc about it, both as long as the torque is large.
-function torqueArrow({ colour, values, most, longest, size }) {
+function torqueArrow({ colour, values, longest, size }) {
+  const most = largest(values, 3);
   const group = new THREE.Group();
   const material = seenThrough(colour);
   const axis = arrow(colour, 0.007 * size, material);
@@ -159,14 +174,15 @@ function makeMarks(viewer, info) {
     viewer.scene_tree.find(path).object.add(mark);
     if (mark.show) shows.push(mark.show);
   };
-  info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
-  info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
+  const { size } = info;
+  info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail({ ...each, colour: MARKS[each.name], radius: 0.0055 * size })));
+  info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, radius: 0.004 * size, dashed: true })));
   const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
   const base = viewer.scene_tree.find(info.base).object;
   for (const each of info.arrows) {
-    add(["meshcat", "wrench", each.kind], (each.kind === "force" ? forceArrow : torqueArrow)({ ...each, size: info.size }));
+    add(["meshcat", "wrench", each.kind], (each.kind === "force" ? forceArrow : torqueArrow)({ ...each, colour: MARKS[each.kind], size }));
   }
-  info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size: info.size })));
+  info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size })));
   return (i) => {
     wrench.position.copy(base.position);
     for (const show of shows) show(i);

@@ -13,7 +13,7 @@ import pytest
 import fflin
 from fflin.robot.urdf import reader as expansion
 from fflin.robot.urdf.description import Mimic
-from fflin.robot.urdf.reader import describe, read_urdf
+from fflin.robot.urdf.reader import describe, ignored, read_urdf
 from fflin.robot.urdf.xml import parse
 from tests.support.messages import says
 from tests.support.reader_corpus import (
@@ -215,17 +215,17 @@ def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted)
 def test_damping_and_friction_are_recorded_and_noted():
     found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
     assert found.joints["hinge"].damping == 0.25
-    texts = [note for _, _, note in found.advice]
+    texts = [note for _, _, note in ignored(found.joints, "arm")]
     assert ["damping" in text for text in texts] == [True, False]
     assert all("'hinge'" in text for text in texts)
-    assert read(arm()).notes == read(arm()).advice == ()
+    assert read(arm()).notes == (*ignored(read(arm()).joints, "arm"),) == ()
 
 
 def test_notes_name_six_joints_and_count_the_rest():
     links = [link(f"l{k}") for k in range(9)]
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
-    ((_, _, note),) = read(robot(*links, *joints)).advice
+    ((_, _, note),) = ignored(read(robot(*links, *joints)).joints, "robot")
     assert says(note, "'j1', 'j2', 'j3', 'j4', 'j5', 'j6'", "2 more")
 
 
