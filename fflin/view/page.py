@@ -25,7 +25,7 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.robot.equipment.mounting import turned_to
+from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
