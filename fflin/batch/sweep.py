@@ -278,8 +278,17 @@ class ChunkJob:
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code; return the rows for which it is not accurate or possible."""
         kernel, q = self._kernel, rows["q"]
-        if kernel is None or len(q) < LANES:  # too few rows for the kernel
-            return np.arange(len(q))
+        count = len(q)
+        if kernel is None:
+            return np.arange(count)
+        if count < LANES:  # fill up the lanes by repeating the last row
+            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
+            for key, array in out.items():
+                more[key] = np.empty((LANES, *array.shape[1:]))
+            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
         with np.errstate(all="ignore"):
             if self.only_inertia:
                 good = kernel.write_inverse(q, out["B_lower"])

@@ -21,8 +21,8 @@ from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, check_ending, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
+from fflin.campaign.runs import KINDS, kind_named
 from fflin.campaign.spreads import SEED
-from fflin.campaign.statistics import KINDS, kind_named
 from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:

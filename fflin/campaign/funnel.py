@@ -19,8 +19,7 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import CampaignJob, completed
-from fflin.campaign.statistics import EDGE, KINDS, Judge, kind_named
+from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error

@@ -20,9 +20,8 @@ from fflin.base.validation import instance, share, truth, whole
 from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
-from fflin.campaign.runs import CampaignJob, chunk_size, expect
+from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import KINDS
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions

@@ -12,7 +12,7 @@ from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
 from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import TRUSTED, Validity, shown
 
 # For each band: fraction of runs outside it on each side, name and opacity; widest band first.

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from fflin.base.tables import folded, grid
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.runs import KINDS
 from fflin.simulation.run import STOPS
 
 if TYPE_CHECKING:

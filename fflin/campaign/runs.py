@@ -1,4 +1,9 @@
-"""Computation of runs in chunks: eight at a time in compiled code, or one by one in Python."""
+"""Runs of a campaign: their computation in chunks, and their statistics.
+
+Runs are computed eight at a time in compiled code, or one by one in Python. The statistics of a run
+are its final and largest errors, its settling times, and histories at a few times. Their size does
+not depend on the duration of the run.
+"""
 
 import math
 import warnings
@@ -8,30 +13,90 @@ from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from timeit import repeat
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
-from fflin.base.validation import Array
+from fflin.base.rotation import conjugate, quaternion_product
+from fflin.base.validation import Array, Indices, Mask
 from fflin.batch.files import MemoryStore
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.campaign.dispersions import Dispersions
 from fflin.campaign.spreads import placed
-from fflin.campaign.statistics import LOOK, Judge, RunStatistics, errors_of, outcome_of
 from fflin.control.channel import Saturation
-from fflin.dynamics.coordinates import states_of
-from fflin.kernel.tree import LANES
+from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.state import StateMap
+from fflin.kernel import loop
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, empty, laid_out, words_of
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import SLOTS, LaneLoop, engine_of, noises, packed, recorded
+from fflin.simulation import lanes
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
-from fflin.simulation.run import Recording, go, stop_conditions
+from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
+from fflin.simulation.run import Recording, go, stop_conditions, stop_of
 from fflin.simulation.simulate import motion_of
+
+# Kinds of errors with their units. The error of a kind is its largest entry; wheels and modes do
+# not count as joints.
+KINDS = {
+    "attitude": "deg",
+    "position": "m",
+    "joints": "rad|m",
+    "omega_b": "rad/s",
+    "v_b": "m/s",
+    "joint rates": "rad/s|m/s",
+}
+# Attitude error [deg] at which a run is close to the end of the chart.
+EDGE = 176.0
+# LOOK is the number of steps between checks of a stop condition. _LONG is the number of steps per
+# call without a stop condition.
+LOOK, _LONG = 64, 2**20
 
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
+
+# Function of the state errors (N, nx) at the start and now; returns the mask (N,) of ended runs.
+Over: TypeAlias = Callable[[Array, Array], Mask]
+
+# Former names of kinds, which conditions and goals still accept.
+_FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
+
+
+def kind_named(name: str) -> str:
+    """Replace a former name of a kind of error, as in ``worst turning``, by its present name."""
+    of, _, kind = name.rpartition(" ")
+    kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
+    return f"{of} {kind}".strip()
+
+
+class Judge(NamedTuple):
+    """Evaluation of runs, whose results replace the record of a campaign; it is sent to workers."""
+
+    fields: tuple[str, ...]  # names of the results
+    # Return the results (N,) from the runs' outcomes; the first history entry is the start.
+    figures: Callable[[Mapping[str, Array]], dict[str, Array]]
+    over: Over | None = None  # condition that ends a run early
+
+
+def kinds_of(state: StateMap) -> Indices:
+    """Return the index into KINDS of each state (nx,).
+
+    The index is 0 for the attitude and for states without a kind, such as modes. The index is -1
+    for wheels.
+    """
+    kind = np.zeros(state.nx, dtype=np.intp)
+    groups, wheels = state.groups, state.robot.wheels
+    for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
+        kind[group] = number
+    kind[groups.qdot_m] = len(KINDS) - 1
+    for index, joint in enumerate(state.robot.joints):
+        if joint.mode or joint.name in wheels:
+            kind[groups.q_m.start + index] = 0 if joint.mode else -1
+            kind[groups.qdot_m.start + index] = 0
+    return kind
 
 
 class CampaignJob:
@@ -62,17 +127,18 @@ class CampaignJob:
             most = np.full(len(self.plan.initial), np.inf)
             self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.judge, self.plant, times = judge, self.plan.plant, self.plan.times
-        self.engine, state = engine_of(engine, self.plan, many=True), self.plant.state
+        self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
-        # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx).
-        self.target, self._path = self.x0 if self.plan.target is None else self.plan.target, []
+        # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx), whose q
+        # and nu are the arrays of `path`.
+        self.target, self.path = self.x0 if self.plan.target is None else self.plan.target, []
         if reference := self.plan.reference:
             t = times.dt * np.arange(times.steps + 1)
             q, v, _ = map(np.array, zip(*map(reference, t.tolist()), strict=True))
             nu = state.velocities(v)
-            self.target, self._path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
+            self.target, self.path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
         given = dict.fromkeys(state.names, 0.0) if given is None else given
         with placed(given):
             self.dispersions = Dispersions(
@@ -84,8 +150,7 @@ class CampaignJob:
         # run was stopped; and of each array of the result. They follow from a run without steps.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
-        outcome = outcome_of(self.plan, self.target, self.steps, none)
-        self.outcome_shapes = {key: values.shape for key, values in outcome.items()}
+        self.outcome_shapes = {key: x.shape for key, x in self.outcome(none).items()}
         self.shapes: dict[str, tuple[int, ...]] = dict.fromkeys(judge.fields if judge else (), ())
         if judge is None:
             self.shapes |= self.outcome_shapes
@@ -109,12 +174,12 @@ class CampaignJob:
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
-        plan, loop = self.plan, packed(self.plan, stop_conditions(self.plan))
+        plan, arguments = self.plan, lanes.packed(self.plan, stop_conditions(self.plan))
         found: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
         if plan.noise:
-            last = min(plan.times.steps, SLOTS * plan.times.sample)
-            found["of sensors"] = noises(plan, len(loop.law.y), 0, last)[1]
-        left: list[object] = [loop]
+            last = min(plan.times.steps, lanes.SLOTS * plan.times.sample)
+            found["of sensors"] = lanes.noises(plan, len(arguments.law.y), 0, last)[1]
+        left: list[object] = [arguments]
         while left:  # the arrays and numbers in nested tuples
             value = left.pop()
             if isinstance(value, tuple):
@@ -130,14 +195,13 @@ class CampaignJob:
             found = {k: np.empty((len(drawn), *x)) for k, x in self.outcome_shapes.items()}
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
-            loop, over = LaneLoop(self.plan, runs), judge and judge.over
-            statistics = RunStatistics(self.plan, self.target, self.steps, self._path, over)
+            eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
             for first in range(0, len(drawn), LANES):
                 eight, their_out = (
                     {key: each[first : first + LANES] for key, each in arrays.items()}
                     for arrays in (runs, found)
                 )
-                loop.fly(statistics, their_out, eight)
+                eight_runs.fly(statistics, their_out, eight)
         else:
             for row, own in enumerate(drawn):
                 outcome = self._one(own)
@@ -147,6 +211,53 @@ class CampaignJob:
             for key, values in judge.figures(found).items():
                 out[key][:] = values
         return []
+
+    def errors(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the states (N, nx) of q and v at the first N steps, and their errors."""
+        state, target = self.plant.state, self.target
+        moving = target.ndim == 2
+        x = states_of(state, q, state.velocities(v))
+        x = unwound(state, x, target[0] if moving else target)
+        if not moving:
+            return x, x - target
+        return x, unwound(state, moving_errors(state.frame, x, target[: len(x)]))
+
+    def outcome(self, run: Recording) -> dict[str, Array]:
+        """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
+
+        The outcome also has the state errors at the times of the histories.
+        """
+        count, steps, dt = len(run.q), self.steps, self.plan.times.dt
+        kind, target = kinds_of(self.plant.state), self.target
+        target = target[:count] if target.ndim == 2 else target
+        x, signed = self.errors(run.q, run.v)
+        e, u = np.where(kind < 0, 0.0, np.abs(signed)), np.abs(run.u)
+        others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
+        sizes = np.column_stack([attitude_errors(x, target), *others])
+        settled, stop = settled_at(sizes), stop_of(run.stopped)
+        late, kept = is_late(settled, count) | (stop > 0), steps[steps < count]
+
+        def history(values: Array, after: float) -> Array:
+            found = np.full((len(steps), values.shape[1]), after)
+            found[: len(kept)] = values[kept]
+            return found
+
+        return dict(
+            q=run.q[-1],
+            v=run.v[-1],
+            x=x[-1],
+            u=run.u[-1],
+            largest_x=e.max(axis=0),
+            largest_u=u.max(axis=0),
+            errors=sizes[-1],
+            largest=sizes.max(axis=0),
+            settle=np.where(late, np.inf, settled * dt),
+            error_history=history(sizes, np.inf),
+            input_history=history(run.u, 0.0),
+            stop=np.array(float(stop)),
+            end=np.array(run.steps * dt),
+            state_errors=history(signed, np.nan),
+        )
 
     def plan_of(self, drawn: Array) -> Plan:
         """Return the plan of a run (k,)."""
@@ -158,20 +269,16 @@ class CampaignJob:
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
     def _one(self, drawn: Array) -> dict[str, Array]:
         """Return the outcome of a run (k,) in Python."""
-        plan, state = self.plan_of(drawn), self.plant.state
+        plan = self.plan_of(drawn)
         if over := self.judge and self.judge.over:
-
-            def errors(q: Array, v: Array) -> Array:
-                return errors_of(state, self.target, q[None], v[None])[1]
-
-            first = errors(plan.q, plan.v)
+            first = self.errors(plan.q[None], plan.v[None])[1]
 
             def stops(t: float, q: Array, v: Array) -> float:
                 looks = round(t / plan.times.dt) % LOOK == 0
-                return float(not (looks and over(first, errors(q, v))[0]))
+                return float(not (looks and over(first, self.errors(q[None], v[None])[1])[0]))
 
             plan = plan.replace(events=(stops,))
-        return outcome_of(plan, self.target, self.steps, _recorded(plan, every=1))
+        return self.outcome(_recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
@@ -197,8 +304,103 @@ class CampaignJob:
         if self.engine == "python":
             run = _recorded(plan, plan.times.every)
         else:
-            run = recorded(self.plan, self.dispersions.in_lanes(drawn[None]))
+            run = lanes.recorded(self.plan, self.dispersions.in_lanes(drawn[None]))
         return replace(motion_of(plan, run), _nominal=self.plant.robot.urdf_sha256)
+
+
+class RunStatistics(lanes.Statistics):
+    """Statistics of eight parallel runs of a job in compiled code."""
+
+    span = LOOK
+
+    def __init__(self, job: CampaignJob) -> None:
+        self._job, self._state, self._steps = job, (state := job.plant.state), job.steps
+        self._over = job.judge and job.judge.over
+        if self._over is None:
+            self.span = _LONG
+        plan, target, steps, path = job.plan, job.target, job.steps, job.path
+        robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
+        first = target if target.ndim == 1 else target[0]
+        x, y, z = first[:3].tolist()
+        attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
+        law, marks = lanes.no_law(state, plan.initial), empty(loop.RUN_STATISTICS)
+        law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
+        q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
+        marks = marks._replace(
+            robot=marks.robot._replace(
+                index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
+                circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
+                scale=np.array([joint.scale for joint in robot.joints]),
+            ),
+            law=law._replace(near=first[state.groups.q_m]),
+            path=law.path,
+            x_ref=first,
+            q_ref=q_ref,
+            nu_ref=nu_ref,
+            kind=kinds_of(state),
+            settled=SETTLED,
+            tolerance=np.full(kinds, THERE),
+            steps=steps,
+            at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
+            sizes=np.zeros(kinds),
+            largest_x=np.zeros(state.nx),
+            largest_u=np.zeros(nu),
+            largest=np.zeros(kinds),
+            outside=np.full(kinds, -1.0),
+            errors=np.full(len(steps) * kinds, np.inf),
+            inputs=np.zeros(len(steps) * nu),
+            states=np.full(len(steps) * state.nx, np.nan),
+        )
+        self._fresh: list[tuple[Array, Array]] = []
+        self._marks = laid_out(marks, loop.RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
+        self._words = words_of(self._marks, loop.RUN_STATISTICS)
+
+    def reset(self) -> None:
+        """Prepare for eight new runs."""
+        for values, initial in self._fresh:
+            values[:] = initial
+
+    def over(self, q: Array, v: Array) -> Mask:
+        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
+        if self._over is None:
+            return np.zeros(LANES, dtype=bool)
+        first = _by_run(self._marks.states[: self._state.nx])
+        return self._over(first, self._job.errors(q, v)[1])
+
+    def add(self, first: int, rows: Array) -> None:
+        """Add rows (steps, width, LANES) of q, nu, u, .. from step `first` on."""
+        take = kernel("loop", "take", "the run statistics")
+        take(self._words, rows.reshape(-1, LANES), first, len(rows))
+        sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
+        self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]
+
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
+        """Return the outcomes of the runs after `done` steps; `stop` has indices into STOPS."""
+        (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
+        settled = _by_run(marks.outside) + 1.0
+        late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
+        return dict(
+            q=q,
+            v=self._state.spread(nu),
+            x=_by_run(marks.law.x),
+            u=u,
+            largest_x=_by_run(marks.largest_x),
+            largest_u=_by_run(marks.largest_u),
+            errors=_by_run(marks.sizes),
+            largest=_by_run(marks.largest),
+            settle=np.where(late, np.inf, settled * self._job.plan.times.dt),
+            error_history=_by_run(marks.errors, times, len(KINDS)),
+            input_history=_by_run(marks.inputs, times, u.shape[1]),
+            stop=stop,
+            end=np.full(LANES, done * self._job.plan.times.dt),
+            state_errors=_by_run(marks.states, times, self._state.nx),
+        )
+
+
+def _by_run(values: Array, *shape: int) -> Array:
+    """Convert values (.., LANES) with one lane per run to rows (LANES, *shape)."""
+    shape = shape or (len(values),)
+    return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
 
 
 def _recorded(plan: Plan, every: int) -> Recording:

@@ -19,8 +19,7 @@ from scipy.linalg import expm
 import fflin
 from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.report import influences, worst_runs
-from fflin.campaign.runs import CampaignJob
-from fflin.campaign.statistics import KINDS
+from fflin.campaign.runs import KINDS, CampaignJob
 from fflin.simulation.report import error_sizes
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed

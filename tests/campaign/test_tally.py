@@ -7,14 +7,13 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.campaign.runs import CampaignJob
-from fflin.campaign.statistics import (
+from fflin.campaign.runs import (
     KINDS,
     LOOK,
+    CampaignJob,
     Judge,
     RunStatistics,
     kinds_of,
-    outcome_of,
 )
 from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
 from fflin.kernel.loop import take
@@ -97,14 +96,14 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         rest = [np.zeros((STEPS, size)) for size in (6, 3)]
         t, v = job.plan.times.dt * np.arange(STEPS), state.spread(nu)
         run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
-        outcome = outcome_of(job.plan, target, job.steps, run)
+        job.target, job.path = target, [each.ravel() for each in star] if follows else []
+        outcome = job.outcome(run)
         for name, expected in defined(job, target, q, nu, u, 0.0).items():
             np.testing.assert_allclose(
                 outcome[name], expected, rtol=1e-12, atol=1e-10, err_msg=name
             )
         # The kernel's statistics, uncompiled.
-        path = [each.ravel() for each in star] if follows else []
-        marks = as_lists(RunStatistics(job.plan, target, job.steps, path)._marks)
+        marks = as_lists(RunStatistics(job)._marks)
         rows = np.hstack((q, nu, u, np.zeros((STEPS, 9))))
         for first, last in itertools.pairwise((0, 1, 33, STEPS)):
             take(marks, rows[first:last].ravel().tolist(), first, last - first)
@@ -147,15 +146,16 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     robot.follow(q0)
     options["q0"] = q0
     job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "compiled", options)
-    state, home, way = job.plant.state, job.target, []
+    state, home = job.plant.state, job.target
     q, nu, u = rows_of(state, rng, len(job.plan.initial))
     if follows:
         star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
-        home, way = states_of(state, *star), [each.ravel() for each in star]
+        home = states_of(state, *star)
+        job.target, job.path = home, [each.ravel() for each in star]
     rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(0, 2, 1)
     stop, ends = np.arange(LANES) % 3.0, []
     for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
-        lanes = RunStatistics(job.plan, home, job.steps, way)
+        lanes = RunStatistics(job)
         lanes.reset()
         for first, last in itertools.pairwise(cuts):
             for _ in range(2):  # adding rows again changes nothing

@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.base.errors import InputError
-from fflin.campaign.statistics import KINDS, kinds_of
+from fflin.campaign.runs import KINDS, kinds_of
 from fflin.dynamics.state import StateMap
 from tests.robot.test_appendages import beam, full, hub_with_rod, servicer
 
