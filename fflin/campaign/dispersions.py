@@ -23,8 +23,7 @@ from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree, batch_tree
-from fflin.robot.equipment.assembly import first_impossible
-from fflin.robot.equipment.mounting import turned_to
+from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import bodies_named, properties, varied

@@ -119,10 +119,8 @@ def plan(arguments: Namespace) -> Report:
 
     example: fflin plan planar_detumble --target-joint joint_1=0.3 --duration 20 -o plan.npz
     """
-    from fflin.dynamics.points import combined
-
     robot = load_robot(arguments)
-    q0, v0 = state_of(robot, arguments, combined(robot.point, robot.start))
+    q0, v0 = state_of(robot, arguments, robot.point, robot.start)
     motion = fflin.plan(
         robot,
         target_of(robot, arguments)[:2],
@@ -170,11 +168,10 @@ def view(arguments: Namespace) -> Report:
 
     example: fflin view servicer_7dof --joint joint_2=0.4
     """
-    from fflin.dynamics.points import combined
     from fflin.view.live import Live
 
     robot = load_robot(arguments)
-    q, _ = state_of(robot, arguments, combined(robot.point, robot.start))
+    q, _ = state_of(robot, arguments, robot.point, robot.start)
     how = {name: getattr(arguments, name) for name in (*_SHOWN, "frame")}
     live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
     assert isinstance(live, Live)  # since there is no motion
@@ -219,7 +216,9 @@ def designed(
     """Return the robot, the robot of the design, the regulated model, and the regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
-    lin = regulated_part(linear_model(arguments, design)[1], arguments)
+    _, lin = linear_model(arguments, design)
+    if arguments.reduce:
+        lin = fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
 
 
@@ -228,13 +227,6 @@ def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
     names = ("q", "r", "bryson")
     given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
     return given if any(given.values()) else {}
-
-
-def regulated_part(lin: fflin.LinearModel, arguments: Namespace) -> fflin.LinearModel:
-    """Return the model for the design: the controllable part of `lin` if --reduce is given."""
-    if not arguments.reduce:
-        return lin
-    return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
@@ -334,14 +326,11 @@ def start_of(
     robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
     """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
-    from fflin.dynamics.points import combined
-
     point, number = robot.point, arguments.relative_equilibrium
     if number:  # the start is relative to this pose, which replaces the pose of the point
         point = {part: point[part] for part in ("joints", "velocity") if part in point}
     rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
-    state = combined(combined(point, {"velocity": rates}), robot.start)
-    q, v = state_of(robot, arguments, state)
+    q, v = state_of(robot, arguments, point, {"velocity": rates}, robot.start)
     if number:
         import pinocchio as pin
 
@@ -372,7 +361,8 @@ def about_point(
         lin = _about_gain(design, gain, arguments)
     else:
         lin = model_about(design, arguments, *target_of(design, arguments))
-        lin = regulated_part(lin, arguments)
+        if arguments.reduce:
+            lin = fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     if arguments.mpc:
         by = _mpc(lin, arguments)
         return by, fflin.StateFeedback(by.lin, by.gain.K), None
@@ -447,6 +437,4 @@ def target_of(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
     """Return q (nq,), v (nv,) and the reference of the target, by default the operating point."""
-    from fflin.dynamics.points import combined
-
-    return point_of(robot, arguments, combined(robot.point, robot.target), "target_")
+    return point_of(robot, arguments, robot.point, robot.target, prefix="target_")

@@ -38,9 +38,9 @@ def whole(text: str) -> int:
 
 def count_of(text: str) -> int:
     """Read a positive integer."""
-    if not (count := whole(text)):
+    if not whole(text):
         raise argparse.ArgumentTypeError("0 is too small, expected 1 or more")
-    return count
+    return int(text)
 
 
 def input_file(text: str) -> Path:
@@ -283,28 +283,26 @@ class Help(argparse.Action):
 def short_help(command: argparse.ArgumentParser) -> str:
     """Return a short help: the first sentence about each common option of a command."""
     arguments = [each for each in command._actions if not each.option_strings]
-    every = [each for each in command._actions if each.option_strings]
-    options = {each.dest.replace("_", "-"): each for each in every[1:]}
+    _, *every = (each for each in command._actions if each.option_strings)
+    options = {each.dest.replace("_", "-"): each for each in every}
     common = [*common, "json"] if (common := command.get_default("common")) else [*options]
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
     required = [f"{each.option_strings[-1]} {each.metavar}" for each in every if each.required]
-    operands = " ".join([*(str(each.metavar) for each in arguments), *required])
-    formatter.add_text(" ".join(f"usage: {command.prog} {operands} [options]".split()))
+    operands = [command.prog, *(str(each.metavar) for each in arguments), *required]
+    formatter.add_text(f"usage: {' '.join(operands)} [options]")
     formatter.add_text(command.description)
-    for title, actions in (
-        ("arguments", arguments),
-        ("options", [options[name] for name in common]),
-    ):
+    shown = {"arguments": arguments, "options": [options[name] for name in common]}
+    for title, actions in shown.items():
         formatter.start_section(title)
-        for action in actions:
-            shown, text = copy.copy(action), action.help or ""
+        for action in map(copy.copy, actions):
+            text = action.help or ""
             first = re.split(r"; |(?<!\.)\. ", text.removesuffix(_REPEATABLE))[0]
-            shown.help = first + _REPEATABLE * text.endswith(_REPEATABLE)
-            formatter.add_argument(shown)
+            action.help = first + _REPEATABLE * text.endswith(_REPEATABLE)
+            formatter.add_argument(action)
         formatter.end_section()
     formatter.add_text(command.epilog)
     if options:
-        formatter.add_text(f"help for all {len(every) - 1} options: {command.prog} --help all")
+        formatter.add_text(f"help for all {len(every)} options: {command.prog} --help all")
     return formatter.format_help()
 
 
@@ -322,16 +320,14 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[tuple[Path
 
 def settle_former_names(arguments: argparse.Namespace) -> None:
     """Set the time options that are given under their former names, with a warning."""
-    step, sample = (getattr(arguments, name, None) for name in ("step", "former_dt"))
-    if step is not None:
+    if (step := getattr(arguments, "step", None)) is not None:
         said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:
             said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = step
-    elif sample is not None:
+        warnings.warn(said, FflinWarning, stacklevel=2)
+    elif (sample := getattr(arguments, "former_dt", None)) is not None:
         said = f"--dt has the new name --sample; write --sample {sample:g}"
         arguments.sample = sample
-    else:
-        return
-    warnings.warn(said, FflinWarning, stacklevel=2)
+        warnings.warn(said, FflinWarning, stacklevel=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from argparse import Namespace
 from collections.abc import Iterable, Mapping
+from functools import reduce
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
@@ -84,15 +85,18 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
 
 
 def state_of(
-    robot: fflin.Robot, arguments: Namespace, state: Mapping[str, Any], prefix: str = ""
+    robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None]:
     """Return q (nq,) and v (nv,) of a robot's state, which the options of a command override.
+
+    Of several states, the last has precedence.
 
     The options --joint, --rpy, --position and --velocity may have a prefix, such as ``target_``.
     Warn about exceeded limits of joints.
     """
-    from fflin.dynamics.points import base_of
+    from fflin.dynamics.points import base_of, combined
 
+    state = reduce(combined, states)
     given = {
         name: value
         for name in ("rpy", "position", "joint", "velocity")
@@ -122,7 +126,7 @@ def state_of(
 
 
 def point_of(
-    robot: fflin.Robot, arguments: Namespace, state: Mapping[str, Any], prefix: str = ""
+    robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
     """Return q (nq,), v (nv,) and the reference of an operating point; see `state_of`.
 
@@ -132,7 +136,7 @@ def point_of(
     if number:
         names = (f"{prefix}rpy", f"{prefix}position")
         refuse(arguments, names, "--relative-equilibrium already sets the base pose")
-    q, v = state_of(robot, arguments, state, prefix)
+    q, v = state_of(robot, arguments, *states, prefix=prefix)
     if not number:
         return q, v, reference_of(arguments)
     q, reference = attitude(robot, q, number, arguments.frame)

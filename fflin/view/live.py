@@ -22,8 +22,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
-from fflin.view.page import Page, subtitle
-from fflin.view.scene import body_poses
+from fflin.view.page import Page, body_poses, subtitle
 
 _HOST = "127.0.0.1"
 

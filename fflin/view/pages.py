@@ -25,9 +25,8 @@ from fflin.robot.joints import find_frame, find_joint
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.run import Plant
-from fflin.view.page import Page, packed, subtitle
+from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.panel import panel
-from fflin.view.scene import Drawing, body_poses
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame

@@ -9,10 +9,9 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.page import Page
+from fflin.view.page import Page, body_poses
 from fflin.view.pages import mode_page
 from fflin.view.panel import panel
-from fflin.view.scene import body_poses
 from fflin.view.shapes import shapes
 
 

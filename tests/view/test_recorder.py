@@ -8,8 +8,7 @@ import umsgpack
 
 
 def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
-    from fflin.view.page import Recorder
-    from fflin.view.scene import Visualizer
+    from fflin.view.page import Recorder, Visualizer
 
     g = importlib.import_module("meshcat.geometry")  # after fflin.scene, which quiets it
 

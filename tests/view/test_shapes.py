@@ -160,8 +160,7 @@ def test_meshes_are_found_where_urdfs_say(tmp_path):
 
 
 def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
-    from fflin.view.page import Recorder
-    from fflin.view.scene import Drawing, Visualizer
+    from fflin.view.page import Drawing, Recorder, Visualizer
 
     tetrahedron(tmp_path / "t.stl")
     path = write(

@@ -7,6 +7,7 @@ const NARROW = 700; // narrower windows have the panel under the scene [CSS pixe
 
 // Directions towards the camera, y up.
 const VIEWS = { front: [1, 0, 0], side: [0, 0, 1], top: [0.001, 1, 0] };
+const OVERVIEW = { space: [1, 0.5, 0.62], lab: [1, 0.36, 0.62] };
 
 function makeCamera(viewer, info, aim) {
   const { camera, controls } = viewer, { size } = info;
@@ -89,7 +90,7 @@ function makeCamera(viewer, info, aim) {
   // Until somebody takes the camera, it frames the robot anew in every window.
   let follow = Boolean(info.follow), view = "overview", taken = false, onTaken = () => {};
   const reframe = () => {
-    const back = view === "overview" ? yUp(info.direction) : new THREE.Vector3(...VIEWS[view]);
+    const back = new THREE.Vector3(...(view === "overview" ? OVERVIEW[info.scene] : VIEWS[view]));
     frame(info.points.map((p) => yUp(new THREE.Vector3(...p).add(gone).toArray())), back.normalize());
   };
   const step = () => {
@@ -112,7 +113,7 @@ function makeCamera(viewer, info, aim) {
     if (name === "tool") {
       last.tool = points.tool();
       taken = true;
-      look(yUp(last.tool.toArray()), yUp(info.direction).normalize(), 0.9 * size);
+      look(yUp(last.tool.toArray()), new THREE.Vector3(...OVERVIEW[info.scene]).normalize(), 0.9 * size);
     } else reframe();
   };
   const before = new THREE.Vector3();

@@ -2,6 +2,9 @@
 // three.js turns to y-up: (x, y, z) of the scene is (x, z, -y) to the camera, or in orbit what its
 // `up` says.
 
+// Direction to the sun, in the axes of the screen.
+const SUN = [0.62, 0.62, 0.78];
+
 const upright = new THREE.Quaternion();
 const yUp = ([x, y, z]) => new THREE.Vector3(x, y, z).applyQuaternion(upright);
 
@@ -24,7 +27,7 @@ function makeStage(info) {
   viewer.set_property(["Grid"], "visible", false);
   viewer.set_property(["Axes"], "visible", false);
 
-  const towardsSun = yUp(info.sun).normalize();
+  const towardsSun = new THREE.Vector3(...SUN).normalize();
   const sky = makeSky(renderer, towardsSun, space, orbit);
   scene.background = orbit ? null : sky.background;
   scene.environment = sky.environment;
