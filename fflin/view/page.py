@@ -4,6 +4,8 @@ Each body has a node, with its visual elements below. Wheels and thrusters are d
 on the links.
 """
 
+from __future__ import annotations
+
 import base64
 import json
 import math
