@@ -284,17 +284,17 @@ def predictor(plan: Plan) -> Predictor | None:
                 return u
 
             return lin, command
-        offset: Array = np.zeros(len(lin.u0))
-        gains: Array = np.zeros(lin.B.T.shape)
-        # An allocation has no K of its own, because it is nonlinear.
-        K = None if own is None else getattr(policy, "K", None)
         if isinstance(policy, LinearController):
-            lin, gains, offset = policy.around(lin)
-        elif own is not None and K is not None:
-            fed = [lin.state_names.index(name) for name in own.state_names]
-            gains[:, fed], offset = -K, own.u0 - K @ (lin.x0[fed] - own.x0)
-        if policy is None or K is not None or isinstance(policy, LinearController):
-            return lin, lambda e: offset + gains @ e
+            both, gains, offset = policy.around(lin)
+            return both, lambda e: offset + gains @ e
+        if policy is None:
+            none = np.zeros(len(lin.u0))
+            return lin, lambda _: none
+        gain = getattr(policy, "K", None)  # an allocation has none, because it is nonlinear
+        if own is not None and gain is not None:
+            K, constant, _ = StateFeedback(own, gain).terms(state)
+            at_point = constant - K @ lin.x0
+            return lin, lambda e: at_point - K @ e
     if linear is None:
         return None
     raise InputError(
