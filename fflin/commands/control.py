@@ -381,17 +381,17 @@ def about_point(
 
 def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
     """Return the predictive controller with the weights and limits of the arguments."""
+    from fflin.control.default_weights import AT_A_POINT
     from fflin.control.mpc import Mpc
     from fflin.control.weights import rule_weights
 
     if (sample := arguments.sample) is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    settings = {"horizon": arguments.horizon, "dt": sample, "limits": limits_of_options(arguments)}
-    if given := weights_of(arguments):
-        Q, R, _, _ = rule_weights(lin.discretize(sample), arguments.weights, given)
-        by = fflin.mpc(lin, Q, R, **settings)
-    else:
-        by = fflin.mpc(lin, weights=arguments.weights, **settings)
+    # Weights of the integral, although the rule considers the sample time.
+    pace = AT_A_POINT._replace(hold=sample)
+    Q, R, *_ = rule_weights(lin, arguments.weights, weights_of(arguments), pace=pace)
+    limits = limits_of_options(arguments)
+    by = fflin.mpc(lin, Q, R, horizon=arguments.horizon, dt=sample, limits=limits)
     assert isinstance(by, Mpc)  # since the model is about a point
     return by
 
