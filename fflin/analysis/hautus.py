@@ -176,9 +176,8 @@ def unobservable(
     fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
     unit = slow / fast if fast and slow else 1.0
     scale = np.concatenate((1.0 / system.size, unit / system.size))
-    basis, at_origin = ranks.null_space(
-        ranks.stacked([*rows, [position, velocity]]) @ np.diag(scale)
-    )
+    seen = ranks.stacked([*rows, [position, velocity]])
+    basis, at_origin = ranks.null_space(seen @ np.diag(scale))
     margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
     at_zero = basis * scale[:, None]
     motions, poles = [at_zero], [0j] * at_zero.shape[1]

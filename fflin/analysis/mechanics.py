@@ -284,15 +284,6 @@ def grouped(names: tuple[str, ...]) -> list[str]:
     return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
 
 
-_RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
-
-
-def rate_of(name: str) -> str:
-    """Return the name of the rate of a coordinate, or "" if the name is not a coordinate."""
-    group, _, member = name.partition(".")
-    return f"{_RATES[group]}.{member}" if group in _RATES else ""
-
-
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
     """Format a linear combination by its largest terms; `sizes` makes the weights comparable."""
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]

@@ -61,19 +61,14 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
     """Write a record in the format of the file's ending, with its digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
-    write_atomically({path: _CODECS[path.suffix][0](record, checksummed)})
+    write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
     """Return the record in a file, and whether its digest was verified; call within `reading`."""
     # The shape of an array may change, because .mat has no vectors and .json has no empty matrices.
     check_ending(path, FORMATS)
-    return decoded(path.suffix, read_file(path, path.suffix))
-
-
-def decoded(suffix: str, content: bytes) -> tuple[Record, bool]:
-    """Return the record in the content of a file, and whether its digest was verified."""
-    return _CODECS[suffix][1](content)
+    return CODECS[path.suffix][1](read_file(path, path.suffix))
 
 
 @contextmanager
@@ -240,12 +235,12 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     return record, bool(found)
 
 
-_CODECS = {
+CODECS = {
     ".npz": (_to_npz, _from_npz),
     ".mat": (_to_mat, _from_mat),
     ".json": (_to_json, _from_json),
 }
-FORMATS = tuple(_CODECS)
+FORMATS = tuple(CODECS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

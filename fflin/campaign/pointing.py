@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
-from fflin.robot.equipment.mounting import turned_to
+from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot

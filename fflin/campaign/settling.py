@@ -10,7 +10,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fflin.analysis.mechanics import rate_of
 from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
@@ -84,11 +83,12 @@ class Loop:
         """Matrix P of the Lyapunov function of the linear loop."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        names = self.lin.state_names
+        names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
         # The size of a coordinate is the size of its rate times the decay rate. Some rates have no
         # coordinate.
-        size = [self.decay * of[rate_of(name)] for name in names if name not in of]
+        rates = dict(zip(full, full[len(full) // 2 :], strict=False))
+        size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
         solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
         P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)

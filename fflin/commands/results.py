@@ -153,7 +153,7 @@ def kind_of(path: Path) -> str:
     """Return the class name of the result in a file, or "" if the class is unknown."""
     import numpy as np
 
-    from fflin.base.record import decoded, text
+    from fflin.base.record import CODECS, text
 
     kind = ""
     try:
@@ -169,7 +169,7 @@ def kind_of(path: Path) -> str:
             with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
                 names, kind = {*entries}, text(entries.get("kind", ""))
         else:
-            entries, _ = decoded(path.suffix, path.read_bytes())  # `read_file` registers an input
+            entries, _ = CODECS[path.suffix][1](path.read_bytes())  # `read_file` registers an input
             names, kind = {*entries}, text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types
         return ""

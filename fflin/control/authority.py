@@ -10,7 +10,7 @@ import pinocchio as pin
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, Mask
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.equipment.mounting import carrier
+from fflin.robot.equipment.assembly import carrier
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot

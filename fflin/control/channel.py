@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -58,9 +59,7 @@ def saturation(
     at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
     least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
-    # An on-off thruster without a finite limit uses its own `max`.
-    own = [item.ranges[0][1] if item.on_off else np.inf for _, item in thrusters.values()]
-    most = np.where(np.isfinite(high[at]), high[at], own)
+    most = high[at]
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         why = (
@@ -100,38 +99,37 @@ def warn_beyond(
         warnings.warn(said, FflinWarning, stacklevel=3)
 
 
+@dataclass(frozen=True, eq=False)
 class Law:
     """Policy whose commands (nu,) are checked; the policy gets copies of q and v."""
 
-    def __init__(
-        self,
-        policy: Callable[[float, Array, Array], object],
-        names: tuple[str, ...],
-        limits: tuple[Array, Array],
-        slow: float,
-    ) -> None:
-        # A motion whose squared velocity exceeds `slow` counts as diverging. A command that is not
-        # finite then raises no error.
-        self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
-        self._shape = (len(names),)
-        # Only a policy that integrates its own state has `advance`.
-        self.advance: Callable[..., None] | None = getattr(policy, "advance", None)
+    policy: Callable[[float, Array, Array], object]
+    names: tuple[str, ...]
+    limits: tuple[Array, Array]
+    # A motion whose squared velocity exceeds this counts as diverging. A command that is not finite
+    # then raises no error.
+    slow: float
+
+    @property
+    def advance(self) -> Callable[..., None] | None:
+        """Method that integrates the policy's own state, or None if it has none."""
+        return getattr(self.policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
         u = self.policy(t, q.copy(), v.copy())
         own = type(u) is np.ndarray and u.dtype is DOUBLE
         u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
-        if u.shape == self._shape and math.isfinite(u.dot(u)):
+        names, shape = self.names, (len(self.names),)
+        if u.shape == shape and math.isfinite(u.dot(u)):
             return u
-        names = self._names
-        if u.shape != self._shape:
+        if u.shape != shape:
             raise InputError(
-                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {self._shape} "
-                f"with one value for each of {listed(names)}"
+                f"policy(t, q, v) returned shape {u.shape} at t = {t:g} s, expected {shape} with "
+                f"one value for each of {listed(names)}"
             )
-        wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
-        if len(wrong) and float(v.dot(v)) < self._slow:
+        wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self.limits)))
+        if len(wrong) and float(v.dot(v)) < self.slow:
             raise InputError(
                 f"policy(t, q, v) returned {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
                 "expected finite numbers"

@@ -79,13 +79,11 @@ class Limit(NamedTuple):
     what: str
 
 
-AT_A_POINT = Pace()
+def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
+    """Return weights with which a displaced robot stays within its limits on its return (10.7).
 
-
-def default_weights(
-    lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
-) -> Weights:
-    """Return weights with which a displaced robot stays within its limits on its return (10.7)."""
+    `momenta` {rate of a wheel: largest momentum that the inputs may add to the wheel}.
+    """
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
@@ -95,7 +93,7 @@ def default_weights(
         )
     damping, w = _damping(lin), pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
-        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta or {})
+        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta)
         w, before = found.bandwidth, w
         if _NOT_ENOUGH in found.rule or w > 0.97 * before:
             break

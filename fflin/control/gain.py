@@ -299,7 +299,7 @@ def _poles(gain: Gain) -> str:
     """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
-    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping"]
+    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
     rows = Counter(
         (
             f"{poles[k].real:.5g}" + (f" +- {poles[k].imag:.5g}i" if poles[k].imag else ""),
@@ -308,11 +308,10 @@ def _poles(gain: Gain) -> str:
         )
         for k in np.argsort(-rates.real)
     )
-    body = [list(row) for row in rows]
-    if max(rows.values()) > 1:
-        heads.append("times")
-        body = [[*row, f"{count}"] for row, count in rows.items()]
-    return f"poles of A - B K, slowest first\n\n{grid(cut([heads, *body]), 'l')}"
+    table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
+    if max(rows.values()) == 1:
+        table = [row[:-1] for row in table]
+    return f"poles of A - B K, slowest first\n\n{grid(cut(table), 'l')}"
 
 
 class Margins(NamedTuple):

@@ -12,13 +12,13 @@ from fflin.analysis.reduction import outputs_of, regulated_part, selection
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, number
+from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
-from fflin.control.tvlqr import FilterSchedule, asks_steady, require_continuous, steady_end
-from fflin.control.weights import Weight, columns, weight
+from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time, steady_end
+from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 from fflin.linear.model import ControlSystem, LinearModel, state_space
@@ -376,8 +376,7 @@ def tvkalman(
     >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
     (21, 18, 18)
     """
-    require_continuous(traj)
-    dt = number("sample", sample)
+    dt = sample_time(traj, sample)
     V = weight("V", V, traj.output_names, definite=True)
     noise, columns = disturbance(traj, W, G)
     columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
@@ -433,14 +432,10 @@ def disturbance(
     nx = len(of.state_names)
     if G is None:
         return weight("W", W, of.state_names), np.eye(nx)
-    if dimension("G", G) == np.ndim(of.A) == 3:
-        through = np.array([columns("G", each, nx) for each in np.asarray(G)])
-        if len(through) != len(of.A):
-            raise InputError(
-                f"G has {len(through)} matrices, expected {len(of.A)}, one for each knot"
-            )
-    else:
-        through = columns("G", G, nx)
+    knots = of.A.shape[:1] if dimension("G", G) == of.A.ndim == 3 else ()
+    shape = *knots, nx, max((1, *np.shape(G))[-1], 1)
+    hint = f": {'one matrix for each knot, with ' if knots else ''}one column for each disturbance"
+    through = shaped("G", G, shape, hint)
     same = np.array_equal(through, of.B)
     names = input_keys(of) if same else [f"w_{i + 1}" for i in range(through.shape[-1])]
     return weight("W", W, names), through

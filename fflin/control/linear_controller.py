@@ -15,7 +15,7 @@ import numpy as np
 
 from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number
+from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
@@ -331,13 +331,10 @@ def _checked(*given: Any) -> System:
         A, B, C = np.zeros((0, 0)), np.zeros((0, ny)), np.zeros((nu, 0))
     elif D.size == 1 and not D.any():
         D = np.zeros((nu, ny))
+    hint = f", for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
     shapes = (nz, nz), (nz, ny), (nu, nz), (nu, ny)
     for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
-        if each.shape != shape or not np.isfinite(each).all():
-            raise InputError(
-                f"{key} of the controller has shape {each.shape}, expected {shape} with finite "
-                f"entries, for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
-            )
+        shaped(f"{key} of the controller", each, shape, hint)
     if dt is not None:
         # A sampled system with unknown sample time has dt = True in python-control and -1 in
         # MATLAB.

@@ -205,9 +205,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
     whole, lin = lin, regulated_part(lin, wheel_speeds=False)
     m, half = len(lin.A) // 2, len(whole.A) // 2
     s, L = lin.A[:m, m:].diagonal(), lin.B[m:]
-    expected = np.zeros_like(lin.A)
-    expected[:m, m:] = np.diag(s)
-    if len(lin.A) != 2 * m or not np.array_equal(lin.A, expected) or lin.B[:m].any():
+    if not np.array_equal(lin.A, np.diag(s, m)) or lin.B[:m].any():
         raise InputError(
             "the model is not a set of double integrators, expected a model at rest without "
             "gravity, orbit, springs or dampers; use lqr for this model"
@@ -232,13 +230,12 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
         P = np.block([[P11, P12], [P12, P22]])
         inverse = np.linalg.inv(L) if L.shape == (m, m) else np.linalg.pinv(L)
         K = inverse @ np.hstack((np.diag(kp), np.diag(kd)))
+        equation = Riccati(lin.A, np.eye(2 * m)[:, m:], Q, np.diag(ra), None, 0.0)
         try:
-            accelerated = np.vstack((np.zeros((m, m)), np.eye(m)))
-            residual = Riccati(lin.A, accelerated, Q, np.diag(ra), None, 0.0).trial(P).residual
-            sound = bool((poles.real < 0.0).all() and np.isfinite(K).all())
+            residual = equation.trial(P).residual
         except np.linalg.LinAlgError:
-            sound = False
-    if not sound:
+            residual = np.inf
+    if not (residual < np.inf and (poles.real < 0.0).all() and np.isfinite(K).all()):
         raise InputError(
             "the solution overflows with these weights; give Qp, Qv and Ra with similar magnitudes"
         )

@@ -208,7 +208,9 @@ def _least(search: Search) -> _Made:
     # If the limits cannot be met between knots, the search is repeated with limits at the knots
     # only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
-        q, v, u = search._replace(cost=cost, parts=parts).best(*guess)
+        q, v, u, *_ = search._replace(cost=cost, parts=parts).best(*guess)
+        if shooting.held:
+            u = np.vstack((u[:-1], u[-2]))  # the last row repeats the input of the last interval
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
         every = max(1, shooting.steps // _PARTS)
         fine = shooting.motions(q, v, u, every * _PARTS)

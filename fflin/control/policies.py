@@ -190,7 +190,6 @@ class AllocatedPolicy:
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
         self.advance = self._command.advance
-        self._inner = inner
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 
@@ -203,7 +202,7 @@ class AllocatedPolicy:
         )
         said = f"allocation: the commanded {', '.join(asked)} are realised by {', '.join(given)}"
         same = self._design.names == self._robot.names
-        return (*[said] * (not same), *getattr(self._inner, "notes", ()))
+        return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner policy."""
@@ -269,40 +268,20 @@ class Sample(NamedTuple):
     y0: Array
     jump: Array | float = 0.0
 
-
-class Compensation:
-    """Control law with a state z that advances at each sample, or at each stage if dt is 0."""
-
-    def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
-        self.at, self.dt = at, dt
-        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
-        self.rates: list[Array] = [self.estimate]
-        self.stages = 0
-
-    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample; `measure(sample, u)` returns y."""
-        by = self.at(t)
-        z = self.estimate + by.jump
-        u: Array = by.u0 + by.C @ z
-        if by.D.any():  # acts on outputs that do not depend on u
-            u = u + by.D @ (measure(by, u) - by.y0)
-        after = by.A @ z + by.B @ (measure(by, u) - by.y0)
-        if self.dt:
-            self.estimate = after
-        else:
-            self.rates.append(after)
-        return u
-
-    def advance(self, weights: Array, last: bool) -> None:
-        """Integrate z to the next stage: sum `weights` times the step's first z and its rates."""
-        if not self.dt:
-            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
-            if last:
-                self.rates, self.stages = [self.estimate], 0
+    def step(self, z: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
+        z = z + self.jump
+        u: Array = self.u0 + self.C @ z
+        if self.D.any():  # acts on outputs that do not depend on u
+            u = u + self.D @ (measure(u) - self.y0)
+        return u, self.A @ z + self.B @ (measure(u) - self.y0)
 
 
-class Loop(Compensation):
-    """Policy that measures a robot's outputs relative to a reference, for a compensator."""
+class Loop:
+    """Policy that measures a robot's outputs relative to a reference, for a compensator.
+
+    The compensator's state z advances at each sample, or at each stage if dt is 0.
+    """
 
     def __init__(
         self,
@@ -313,7 +292,10 @@ class Loop(Compensation):
         at: Callable[[float], Any],
         there: Callable[[float], tuple[Measuring, Array]],
     ) -> None:
-        super().__init__(size, at, dt)
+        self.at, self.dt = at, dt
+        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
+        self.rates: list[Array] = [self.estimate]
+        self.stages = 0
         self._noise, self._there = noise, there
         self._at_rest: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
@@ -341,13 +323,30 @@ class Loop(Compensation):
             size = len(self.at(t).y0)
             noise = vector("noise(t)", self._noise(t), size, "one value for each output")
 
-        def measured(_: Sample, u: Array) -> Array:
+        def measured(u: Array) -> Array:
             a = self._at_rest
             if aba := self._aba:
                 a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
             return np.asarray(measure(x, q, v, a) + noise)
 
-        return self.step(t, measured)
+        u, after = self.step(t, measured)
+        if self.dt:
+            self.estimate = after
+        else:
+            self.rates.append(after)
+        return u
+
+    def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
+        found: tuple[Array, Array] = self.at(t).step(self.estimate, measure)
+        return found
+
+    def advance(self, weights: Array, last: bool) -> None:
+        """Integrate z to the next stage: sum `weights` times the step's first z and its rates."""
+        if not self.dt:
+            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
+            if last:
+                self.rates, self.stages = [self.estimate], 0
 
 
 def decider(policy: object) -> object:

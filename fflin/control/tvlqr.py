@@ -319,8 +319,7 @@ def tvlqr(
     >>> fflin.tvlqr(along, sample=0.1).K.shape
     (21, 9, 18)
     """
-    require_continuous(traj)
-    names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
+    names, dt = traj.state_names, sample_time(traj, sample)
     steady = asks_steady(Qf)
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
@@ -384,11 +383,12 @@ def held_stages(
         yield total, whole
 
 
-def require_continuous(traj: LinearTrajectory) -> None:
-    """Raise `InputError` if traj is not a LinearTrajectory in continuous time."""
+def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
+    """Return the sampling time [s] of a design along a continuous trajectory, 0 if not sampled."""
     expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
+    return 0.0 if sample is None else number("sample", sample)
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:

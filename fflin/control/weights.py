@@ -18,7 +18,7 @@ from fflin.analysis.reduction import (
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
-from fflin.control.default_weights import AT_A_POINT, Pace, default_weights
+from fflin.control.default_weights import Pace, default_weights
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
@@ -127,14 +127,6 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
         matrix = 0.5 * matrix + 0.5 * matrix.T
     require_semidefinite(what, matrix, names, rounding, definite)
     return matrix
-
-
-def columns(what: str, value: ArrayLike, rows: int) -> Array:
-    """Return a checked matrix (rows, k) with k >= 1."""
-    shape = np.shape(value) if dimension(what, value) == 2 else ()
-    if not shape or not shape[1]:
-        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
-    return shaped(what, value, (rows, shape[1]))
 
 
 def require_semidefinite(
@@ -264,7 +256,7 @@ def rule_weights(
     given: Mapping[str, Mapping[str, float]] | None = None,
     *,
     wheel_speeds: bool | None = None,
-    pace: Pace = AT_A_POINT,
+    pace: Pace | None = None,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N by a rule, changed by `given` weights, and a description of the rule."""
     # If the continuous model is known, the cost of a sampled model is the continuous cost with
@@ -276,6 +268,7 @@ def rule_weights(
         name = lin.weights.get("rule")
     terms: Array = np.zeros(sum(lin.B.shape))
     if name is None or name == "urdf":
+        pace = pace or Pace()
         pace = pace._replace(hold=lin.dt or pace.hold)
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":

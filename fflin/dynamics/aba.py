@@ -7,7 +7,6 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.joints import ROOT
 
 
 class Aba:
@@ -82,8 +81,12 @@ class Aba:
             by_q, by_v = state.columns(by_q), state.columns(by_v)
             by_force = state.velocities(by_force)
         self.inverse = by_force
+        at_rest = np.zeros_like(v)
         for joint, momentum in state.robot.stored_momentum:
-            jacobian, turning = self._angular_velocity_derivatives(joint, q, v)
+            pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, at_rest)
+            local = self._model, self._data, joint, pin.ReferenceFrame.LOCAL
+            # Derivatives over q and v of the angular velocity of the link in its axes.
+            turning, jacobian = (x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local))
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
             by_v += torque @ state.columns(jacobian)
@@ -93,7 +96,6 @@ class Aba:
             pin.computeJointJacobians(self._model, self._data, q)
             by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
             field.add_turning(*here, by_q, by_v)
-        at_rest = np.zeros_like(v)
         by_u = []
         for unit, forces in zip(np.eye(len(u)), self.actuation.fixed.T, strict=True):
             wrenches = self.actuation.wrenches(unit) or self._none
@@ -115,24 +117,6 @@ class Aba:
         for joint, pull in enumerate(self.field.wrenches(self._data) if self.field else ()):
             total[joint] += pull
         return total
-
-    def _angular_velocity_derivatives(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the derivatives (3, nv) over v and q of a link's angular velocity in its axes."""
-        # For a joint between base and link, let s be its axis (in link axes) and omega_p the
-        # angular velocity of its parent. The derivative over the joint angle is omega_p x s. The
-        # derivative over a rotation of the base is zero.
-        model, data = self._model, self._data
-        pin.forwardKinematics(model, data, q, v)
-        pin.computeJointJacobians(model, data, q)
-        local = pin.ReferenceFrame.LOCAL
-        jacobian = pin.getJointJacobian(model, data, joint, local)[PIN_ANGULAR]
-        turning = np.zeros_like(jacobian)
-        for support in model.supports[joint].tolist()[ROOT + 1 :]:
-            column, parent = model.idx_vs[support], model.parents[support]
-            relative = data.oMi[joint].rotation.T @ data.oMi[parent].rotation
-            about = relative @ data.v[parent].angular
-            turning[:, column] = np.cross(about, jacobian[:, column])
-        return jacobian, turning
 
     def _passive_force(self, q: Array, v: Array) -> Array:
         stiffness, damping, rest = self.state.robot.springs

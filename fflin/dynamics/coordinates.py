@@ -121,24 +121,15 @@ class Chart:
         return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
 
     @cached_property
-    def Q(self) -> Array:
-        """Q (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
-        return np.asarray(self.q0)[..., None] * _IDENTITY + skew(self.q_b)
-
-    @cached_property
     def N(self) -> Array:
-        """N = Q / 2 (.., 3, 3)."""
-        return 0.5 * self.Q
+        """N = Q / 2 (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
+        return 0.5 * (np.asarray(self.q0)[..., None] * _IDENTITY + skew(self.q_b))
 
     @cached_property
     def J(self) -> Array:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
         # Q^-1 = Q^T + q_b q_b^T / q0.
-        return 2.0 * (self.Q.mT + self._over_q0(self.q_b))
-
-    @cached_property
-    def _back(self) -> Array:
-        return np.ascontiguousarray(self.R.mT)
+        return 2.0 * (2.0 * self.N.mT + self._over_q0(self.q_b))
 
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
@@ -166,7 +157,7 @@ class Chart:
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
         """Multiply parts of x (.., k, m), three columns each, by R^T from the right, in place."""
         for columns in () if self.standing else parts:
-            x[..., columns] = product(x[..., columns], self._back)
+            x[..., columns] = product(x[..., columns], self.R.mT)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts (three rows each) rotated by R to reference axes."""
@@ -174,14 +165,13 @@ class Chart:
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts (three rows each) rotated by R^T to base axes."""
-        return x if self.standing or not parts else _turn(self._back, parts, x.copy("K"))
+        return x if self.standing or not parts else _turn(self.R.mT, parts, x.copy("K"))
 
 
 class Standing(Chart):
     """Chart at one or many attitudes equal to the reference: R = Q = I and J = 2 I."""
 
     standing = True
-    N = 0.5 * _IDENTITY
 
     def __init__(self, *count: int) -> None:
         super().__init__(np.zeros((*count, 3)), 1.0, _IDENTITY)

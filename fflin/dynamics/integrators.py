@@ -7,7 +7,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import unknown
+from fflin.base.errors import require_known
 from fflin.base.validation import Array
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
@@ -111,9 +111,8 @@ INTEGRATORS: dict[str, type[Integrator]] = {
 
 def integrator(name: str) -> type[Integrator]:
     """Return the integrator with a name, or raise `UnknownNameError`."""
-    if not isinstance(name, str) or name not in INTEGRATORS:
-        raise unknown("method", str(name), list(INTEGRATORS))
-    return INTEGRATORS[name]
+    require_known("method", [str(name)], INTEGRATORS)
+    return INTEGRATORS[str(name)]
 
 
 # Commutator-free method of order four (10.3): its Gauss nodes, and the nodes' weights in the first

@@ -254,9 +254,9 @@ class Sensing:
                 indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
-        # Outputs of frames come last, because other outputs overwrite the data that frame outputs
+        # Outputs of frames come first, because other outputs overwrite the data that frame outputs
         # read.
-        self._kinds.sort(key=lambda kind: bool(kind[2]))
+        self._kinds.sort(key=lambda kind: not kind[2])
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
@@ -299,18 +299,13 @@ class Sensing:
             stored=robot.stored_momentum,
             spin=R.T @ state.orbit[0] if state.orbit else np.zeros(3),
         )
-        derived = False
+        point = [at.q, at.v]
+        if self.needs_acceleration:
+            point.append(a.copy())
+            point[-1][PIN_LINEAR] += skew(v[PIN_ANGULAR]).dot(at.v_b) - at.g
+        if self._kinds[0][2]:
+            pin.computeForwardKinematicsDerivatives(at.model, at.data, *point)
         for rows, slopes, frames in self._kinds:
-            if frames and not derived:
-                acceleration: tuple[Array, ...] = ()
-                if self.needs_acceleration:
-                    rate = a.copy()
-                    rate[PIN_LINEAR] += skew(v[PIN_ANGULAR]).dot(at.v_b) - at.g
-                    acceleration = (rate,)
-                pin.computeForwardKinematicsDerivatives(
-                    at.model, at.data, at.q, at.v, *acceleration
-                )
-                derived = True
             slopes(at, sensed.part(rows), *frames)
         return sensed
 

@@ -18,11 +18,11 @@ from fflin.robot.mass_properties import coordinate_names
 # The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
 # grows as 1 / (M^-1)_ii, the inertia of i while all other coordinates are free, becomes small
 # relative to M_ii. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds _WARNING_COUPLING, M^-1 has fewer than nine
+# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine
 # correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
 # smaller sum than the number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
-_WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
+WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
 # Pinocchio's articulated-body inverse sums inertias about the base's origin. With `inertia_bounds`
 # in place of M_ii, the couplings bound the rounding errors of this inverse. If their sum exceeds
@@ -42,9 +42,6 @@ _crba, _compute_inverse, _cholesky = pin.crba, pin.computeMinverse, pin.cholesky
 
 class Inertia:
     """M^-1 at a configuration, in base axes: angular, linear, joints."""
-
-    # M^-1 is accurate if the sum of couplings lies between `least_coupling` and this value.
-    warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
@@ -95,7 +92,7 @@ class Inertia:
             self._state.project(inverse, out)
             coupling = upper.diagonal().dot(inverse.diagonal())
         # A zero pivot gives NaN, which this condition also reports.
-        if not self.least_coupling < coupling < _WARNING_COUPLING:
+        if not self.least_coupling < coupling < WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T))
 
     def _judge(self, coupling: float, M: Array) -> None:

@@ -24,7 +24,7 @@ from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, read_file, write_atomically
-from fflin.control.policies import Loop, Policy, Sample
+from fflin.control.policies import Loop, Policy
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, StateMap
@@ -292,8 +292,8 @@ class _OutputLoop(Loop):
         super().__init__(state, law.dt, None, about["memory"], lambda _: None, lambda _: there)
         self._law, self._u0 = law, np.array(about["u0"])
 
-    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
-        """Return the command of a sample.
+    def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Return the command of a sample, and the next state.
 
         Outputs are measured twice, because an accelerometer measures accelerations under this
         command.
@@ -301,11 +301,10 @@ class _OutputLoop(Loop):
         real, u = self._law._real, self._u0
         for _ in range(2):
             memory, out = np.append(self.estimate, 0.0).astype(real), np.zeros(len(u), real)
-            y = measure(self.at(t), u).astype(real)
+            y = measure(u).astype(real)
             self._law.call(t, memory.ctypes, y.ctypes, out.ctypes)
             u = out.astype(float)
-        self.estimate = memory[:-1].astype(float)
-        return u
+        return u, memory[:-1].astype(float)
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:

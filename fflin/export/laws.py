@@ -15,7 +15,7 @@ from fflin.base.validation import Array, Indices, instance
 from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Compensation, Gridded, Policy, Sample, StateFeedback, bound
+from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import Actuation, StateMap
@@ -286,11 +286,13 @@ def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
         turns = np.zeros(ny)
         turns[turning] = 2.0 * np.pi * random.integers(-3, 4, len(turning))
         y = by.y0 + dy
-        law = Compensation(nz, lambda _: by)
-        law.estimate = z
-        u = law.step(0.0, lambda *_, y=y: y)
+
+        def measured(_: Array, y: Array = y) -> Array:
+            return y
+
+        u, next_z = by.step(z, measured)
         of_z, of_y = np.abs(z), np.abs(y) + np.abs(by.y0) + np.abs(turns)
         scale = np.abs(by.u0) + np.abs(by.C) @ of_z + np.abs(by.D) @ of_y
         after = np.abs(by.A) @ of_z + np.abs(by.B) @ of_y
-        out, scales = np.append(u, law.estimate), np.append(scale, after)
+        out, scales = np.append(u, next_z), np.append(scale, after)
         yield Case(0, np.append(z, y + turns), out, scales)

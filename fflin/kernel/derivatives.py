@@ -25,7 +25,7 @@ using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 import numpy as np
 
 from fflin.base.validation import Array, Mask
-from fflin.dynamics.rnea import Inertia
+from fflin.dynamics.rnea import WARNING_COUPLING
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
@@ -221,7 +221,7 @@ class RowAccelerations:
 
     Its methods return whether (N,) the results are accurate: M is well-conditioned and all angles
     are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy of
-    M^-1; see `Inertia`.
+    M^-1; see `dynamics.rnea`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -260,5 +260,8 @@ class RowAccelerations:
             work_space(self._work),
         )
         # A zero pivot gives NaN, and comparisons with NaN are false.
-        good = (self._least_coupling < judged) & (judged < Inertia.warning_coupling)
-        return good[:, 0] & (np.abs(points[0][:, 7:]) < _FARTHEST).all(axis=1)
+        good = (self._least_coupling < judged) & (judged < WARNING_COUPLING)
+        q_m = points[0][:, 7:]
+        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
+            return good[:, 0]
+        return good[:, 0] & (np.abs(q_m) < _FARTHEST).all(axis=1)

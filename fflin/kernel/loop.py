@@ -138,7 +138,9 @@ def _begin_pulses(channel, step, u):
         store(pulses.level, index, chosen(0.5, fresh, level, load(pulses.level, index)))
 
 
-class Method(namedtuple("Method", "h origin shift speed nodes weights moments")):
+class Method(
+    namedtuple("Method", "h origin shift speed nodes weights moments rates along first second u")
+):
     """Integration method: steps of h [s] with s stages.
 
     - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
@@ -149,6 +151,9 @@ class Method(namedtuple("Method", "h origin shift speed nodes weights moments"))
     - `nodes` [s]: times of the stages.
     - `weights`, `moments`: weights of the stages in an integral and in a double integral over the
       step, including h and h^2.
+    - Work space: v and the accelerations of the stages (`rates`), a displacement (`along`), and q
+      at the `first` and the `second` stage.
+    - `u` (nu,): inputs at the beginning of the last step.
     """
 
 
@@ -159,15 +164,8 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
     """
 
 
-class Stages(namedtuple("Stages", "rates along first second u")):
-    """Work space: v and the accelerations of the stages, a displacement, and q at two stages.
-
-    `u` (nu,) are the inputs at the beginning of the last step.
-    """
-
-
 class Arguments(
-    namedtuple("Arguments", "robot method law channel reference project pushed stop point stages")
+    namedtuple("Arguments", "robot method law channel reference project pushed stop point")
 ):
     """Arguments of `advance`, with the switches for the projection and for external forces."""
 
@@ -175,7 +173,7 @@ class Arguments(
 ARGUMENTS = Struct(
     Arguments,
     robot=MECHANICS,
-    method=Struct(Method, h=REAL, origin=INDICES),
+    method=Struct(Method, REALS, {LANED: "rates along first second u"}, h=REAL, origin=INDICES),
     law=LAW,
     channel=CHANNEL,
     reference=MOMENTUM_REFERENCE,
@@ -183,7 +181,6 @@ ARGUMENTS = Struct(
     pushed=FLAG,
     stop=Struct(StopConditions),
     point=POINT,
-    stages=Struct(Stages, LANED),
 )
 
 
@@ -210,14 +207,14 @@ def goes_on(stop, origin, q, rates):
     return good
 
 
-def _move(robot, method, stages, point, stage):
+def _move(robot, method, point, stage):
     """Move the point from a stage with known acceleration to the next stage or the step's end."""
-    rates, along = stages.rates, stages.along
+    rates, along = method.rates, method.along
     if stage == 1:
-        vec.copy(point.q, 0, stages.second, 0, len(point.q))
+        vec.copy(point.q, 0, method.second, 0, len(point.q))
     _combine(method.shift, stage, rates, along)
     _combine(method.speed, stage, rates, point.nu)
-    begin = stages.first if method.origin[stage] == 0 else stages.second
+    begin = method.first if method.origin[stage] == 0 else method.second
     vec.displace(robot.tree, begin, along, point.q)
     if stage == len(method.origin) - 1:
         _combine(method.shift, stage + 1, rates, along)
@@ -236,14 +233,13 @@ def advance(words, clock, last, every, rows, work):
     """
     of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
-    point, stages = of.point, of.stages
-    h, at = method.h, 0  # `at` is the place of the next entry in `rows`
+    point, h, at = of.point, method.h, 0  # `at` is the place of the next entry in `rows`
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
     for step in range(clock[0], last):
-        vec.copy(point.q, 0, stages.first, 0, len(point.q))
-        vec.copy(point.nu, 0, stages.rates, 0, len(point.nu))
+        vec.copy(point.q, 0, method.first, 0, len(point.q))
+        vec.copy(point.nu, 0, method.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
@@ -254,7 +250,7 @@ def advance(words, clock, last, every, rows, work):
             forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
             forward.turn_held(robot, point)
             if stage == 0:
-                vec.copy(point.u, 0, stages.u, 0, len(point.u))
+                vec.copy(point.u, 0, method.u, 0, len(point.u))
                 if every > 0 and step % every == 0:
                     for values in (point.q, point.nu, point.u):
                         vec.copy(values, 0, rows, at, len(values))
@@ -263,11 +259,11 @@ def advance(words, clock, last, every, rows, work):
                     vec.put6(rows, at, momentum)
                     vec.put3(rows, at + 6, center)
                     at += 9
-            forward.accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
+            forward.accelerate(work, robot, point, method.rates, (1 + stage) * len(point.nu))
             if of.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
-            _move(robot, method, stages, point, stage)
+            _move(robot, method, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)

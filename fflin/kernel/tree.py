@@ -221,16 +221,18 @@ def _tree(robot: Robot) -> Tree | None:
     bodies = len(joints)
     parent = np.array([max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)])
     fixed, inertias = np.zeros((bodies, 12)), np.zeros((bodies, 10))
-    for body in range(bodies):
-        if body:
-            before = places[parent[body]].inverse()
-            placement = before * model.jointPlacements[ROOT + body] * places[body]
-            fixed[body] = np.concatenate((placement.rotation.ravel("F"), placement.translation))
-        inertia = places[body].actInv(model.inertias[ROOT + body])
-        inertias[body, 0] = inertia.mass
-        inertias[body, 1:4] = inertia.mass * inertia.lever
-        inertias[body, 4:] = inertia.matrix()[PIN_ANGULAR, PIN_ANGULAR][np.triu_indices(3)]
-    coordinate, factor = _coordinates(robot)
+    for body, place in enumerate(places):
+        placement = places[parent[body]].inverse() * model.jointPlacements[ROOT + body] * place
+        fixed[body] = np.concatenate((placement.rotation.ravel("F"), placement.translation))
+        # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
+        dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
+        inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
+    # The coordinate that moves each body's joint, and the joint's motion per unit of it.
+    moved = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
+    for follower, leader, multiplier, _ in robot.followers:
+        moved[follower.idx_v] = (moved[leader.idx_v][0], multiplier)
+    of_bodies = [(5, 1.0), *(moved[joint.idx_v] for joint in joints[1:])]
+    coordinate, factor = map(list, zip(*of_bodies, strict=True))
     state, size = StateMap(robot), 6 + robot.n
     paths = _paths(size, parent, coordinate)
     row = np.cumsum([0, *map(len, paths[:-1])])
@@ -310,15 +312,6 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
         return None
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
     return pin.SE3(rotation.normalized().matrix(), np.zeros(3)), turn, slide
-
-
-def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
-    """Return the coordinate that moves each body's joint, and the joint's motion per unit of it."""
-    at = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
-    for joint, leader, multiplier, _ in robot.followers:
-        at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
-    moved = [at[joint.idx_v] for joint in robot.model.joints.tolist()[ROOT + 1 :]]
-    return [5, *(index for index, _ in moved)], [1.0, *(factor for _, factor in moved)]
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:

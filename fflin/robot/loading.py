@@ -117,18 +117,12 @@ def load(
     dirs = (*dirs, *found.package_dirs)
     # Meshes are read only when the robot is drawn, so output files must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
-    damping = {name: urdf.joints[name].damping for name in loaded.joint_names}
-    # Damping of a mimic joint is added to its leader so that the dissipated power remains the
-    # same.
-    for joint, leader, multiplier, _ in loaded.followers:
-        damping[leader.name] += multiplier**2 * urdf.joints[joint.name].damping
     loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=urdf.sha256,
         notes=urdf.notes,
         package_dirs=dirs,
-        urdf_damping=damping,
         links={
             name: LinkMass(link.mass, link.tensor, link.com.placement)
             for name, link in urdf.links.items()
@@ -209,8 +203,6 @@ def from_model(
     name = name or model.name or "model"
     _check_model(copy, name)
     robot = _robot(copy, name, requested(() if lock is None else lock), {})
-    own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
-    robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
 
 
@@ -232,20 +224,20 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
     locked: tuple[str, ...] = ()
     if lock:
         model, mimics, locked = locked_model(model, lock, mimics)
-    all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
-    by_name = {joint.name: joint for joint in all_joints}
-    joints = tuple(joint for joint in all_joints if joint.name not in mimics)
-    followers = tuple(
-        Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
-        for joint, mimic in mimics.items()
-    )
+    by_name = {model.names[i]: joint_of(model, i) for i in range(ROOT + 1, model.njoints)}
+    joints = tuple(joint for name, joint in by_name.items() if name not in mimics)
+    followers = tuple(Follower(by_name[x], by_name[m.leader], *m[1:]) for x, m in mimics.items())
     # In depth-first order, the indices of each subtree have no gaps.
     if any(subtree[len(subtree) - 1] - subtree[0] >= len(subtree) for subtree in model.subtrees):
         raise ModelError(
             f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA gives "
             "wrong results; add all joints of one branch before the joints of the next branch"
         )
-    return Robot(model, name, joints, followers, locked=locked)
+    damping = {joint.name: float(model.damping[joint.idx_v]) for joint in joints}
+    # Damping of a mimic joint is added to its leader so that the dissipated power remains the same.
+    for each, leader, multiplier, _ in followers:
+        damping[leader.name] += multiplier**2 * float(model.damping[each.idx_v])
+    return Robot(model, name, joints, followers, locked=locked, urdf_damping=damping)
 
 
 def _check_model(model: pin.Model, name: str) -> None:

@@ -15,8 +15,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known, unknown
 from fflin.base.validation import Array
 from fflin.robot.equipment.appendages import Appendage
-from fflin.robot.equipment.assembly import equipped, with_appendages
-from fflin.robot.equipment.mounting import stored_momentum
+from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
 from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame

@@ -11,8 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.equipment.assembly import equipped
-from fflin.robot.equipment.mounting import carry_over
+from fflin.robot.equipment.assembly import carry_over, equipped
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import LinkMass, dynamic_parameters

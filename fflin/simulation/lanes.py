@@ -242,7 +242,7 @@ class LaneLoop:
         point, kept, count = self.parts.point, self.parts.reference, len(ending)
         conserved = kept.start[:9] + kept.sums[:9]
         conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
-        last = np.vstack((point.q, point.nu, self.parts.stages.u, conserved))
+        last = np.vstack((point.q, point.nu, self.parts.method.u, conserved))
         diverged = (stop == STOPS.index("diverged"))[:count]
         for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
             if finite:  # the last state of a diverged run may not be finite, so it is not added
@@ -274,7 +274,7 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
         if not loop.done:
             raise
         stopped = f"interrupted at t = {loop.done * dt:g} s"
-    if runs is None and not np.isfinite(loop.parts.stages.u).all():
+    if runs is None and not np.isfinite(loop.parts.method.u).all():
         return go(plan)  # raises an error that names the command
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
@@ -305,6 +305,11 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
             nodes=np.minimum(np.array(method.nodes) * h, plan.last_node * h),
             weights=np.array(method.weights) * h,
             moments=h * (np.array(method.moments) * h),
+            rates=np.zeros(speed.shape[1] * size),
+            along=np.zeros(size),
+            first=plan.q,
+            second=plan.q,
+            u=u,
         ),
         law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
@@ -315,13 +320,6 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
         stop=stop._replace(squares=state.velocities(stop.squares)),
         point=forward.Point(
             q=plan.q, nu=state.velocities(plan.v), u=u, pushing=u, wrench=np.zeros(6)
-        ),
-        stages=loop.Stages(
-            rates=np.zeros(speed.shape[1] * size),
-            along=np.zeros(size),
-            first=plan.q,
-            second=plan.q,
-            u=u,
         ),
     )
 

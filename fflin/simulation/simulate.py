@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import LONG_RUN
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
-from fflin.control.policies import Compensation, Policy, StateFeedback, feedback_of
+from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
@@ -275,22 +275,26 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            terms, model = policy.terms, lin
-            law = Compensation(len(terms.A), lambda _: terms)
-            return model, lambda e: law.step(
-                0.0, lambda _, u: model.y0 + model.C @ e + model.D @ (u - model.u0)
-            )
-        offset: Array = np.zeros(len(lin.u0))
-        gains: Array = np.zeros(lin.B.T.shape)
-        # An allocation has no K of its own, because it is nonlinear.
-        K = None if own is None else getattr(policy, "K", None)
+            by, model = policy.terms, lin
+            z: Array = np.zeros(len(by.A))
+
+            def command(e: Array) -> Array:
+                nonlocal z
+                u, z = by.step(z, lambda u: model.y0 + model.C @ e + model.D @ (u - model.u0))
+                return u
+
+            return lin, command
         if isinstance(policy, LinearController):
-            lin, gains, offset = policy.around(lin)
-        elif own is not None and K is not None:
-            fed = [lin.state_names.index(name) for name in own.state_names]
-            gains[:, fed], offset = -K, own.u0 - K @ (lin.x0[fed] - own.x0)
-        if policy is None or K is not None or isinstance(policy, LinearController):
-            return lin, lambda e: offset + gains @ e
+            both, gains, offset = policy.around(lin)
+            return both, lambda e: offset + gains @ e
+        if policy is None:
+            none = np.zeros(len(lin.u0))
+            return lin, lambda _: none
+        gain = getattr(policy, "K", None)  # an allocation has none, because it is nonlinear
+        if own is not None and gain is not None:
+            K, constant, _ = StateFeedback(own, gain).terms(state)
+            at_point = constant - K @ lin.x0
+            return lin, lambda e: at_point - K @ e
     if linear is None:
         return None
     raise InputError(

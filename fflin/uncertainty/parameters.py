@@ -11,7 +11,7 @@ from fflin.base.errors import InputError
 from fflin.base.names import matching, stands_for_any
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, positive
-from fflin.robot.equipment.mounting import carrier
+from fflin.robot.equipment.assembly import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia, sums_of

@@ -4,6 +4,8 @@ Each body has a node, with its visual elements below. Wheels and thrusters are d
 on the links.
 """
 
+from __future__ import annotations
+
 import base64
 import json
 import math
@@ -25,7 +27,7 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import field_of
-from fflin.robot.equipment.mounting import turned_to
+from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot

@@ -11,7 +11,7 @@ from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.pointing import turned
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import CampaignJob
-from fflin.robot.equipment.mounting import turned_to
+from fflin.robot.equipment.assembly import turned_to
 from tests.support import policies
 from tests.support.campaigns import both
 from tests.support.robots import BUNDLED, free_body

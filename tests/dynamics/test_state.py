@@ -149,9 +149,10 @@ def test_chart_matrices(degrees):
     chart = fflin.StateMap(robot).chart(fflin.configuration(robot, base=random_pose(rng, degrees)))
     assert isinstance(chart, Chart)
     E = np.eye(3)
-    assert chart.Q.T @ chart.Q == pytest.approx(E - np.outer(chart.q_b, chart.q_b), abs=1e-15)
-    assert np.linalg.det(chart.Q) == pytest.approx(chart.q0, rel=1e-12)
-    assert chart.Q @ chart.J == pytest.approx(2 * E, abs=1e-12)
+    Q = 2.0 * chart.N
+    assert Q.T @ Q == pytest.approx(E - np.outer(chart.q_b, chart.q_b), abs=1e-15)
+    assert np.linalg.det(Q) == pytest.approx(chart.q0, rel=1e-12)
+    assert Q @ chart.J == pytest.approx(2 * E, abs=1e-12)
 
 
 @pytest.mark.parametrize("frame", FRAMES)

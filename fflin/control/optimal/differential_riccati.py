@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
@@ -82,13 +82,17 @@ def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
 def _constant(coefficients: Coefficients, h: Array) -> Transition:
     """Return transitions for constant coefficients, by scaling and doubling an exponential."""
     A, S, Q = coefficients
-    n, unit = A.shape[-1], _units(*(np.abs(x).max(axis=0) for x in coefficients))
+    n, (a, s, q) = A.shape[-1], (np.abs(x).max(axis=0) for x in coefficients)
+    sizes = np.block([[a, s], [q, a.T]])
+    if not sizes.max() < 1e300:
+        raise np.linalg.LinAlgError("the coefficients are too large")
+    # Units of the states that give rows and columns similar sizes; costates have the inverse units.
+    _, (scale, _) = matrix_balance(sizes, permute=False, separate=True)
+    unit = np.sqrt(scale[:n] / scale[n:])
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
     lower = np.concatenate((-Q, -A.mT), axis=-1)
     H = np.concatenate((np.concatenate((A, -S), axis=-1), lower), axis=-2) * h[:, None, None]
     size = float(np.abs(H).sum(axis=-2).max())
-    if not size < 1e300:
-        raise np.linalg.LinAlgError("the coefficients are too large")
     doublings = max(0, math.ceil(math.log2(max(size, 1.0))))
     theta = expm(H / 2**doublings)
     inverse = np.linalg.inv(theta[:, n:, n:])
@@ -102,20 +106,6 @@ def _constant(coefficients: Coefficients, h: Array) -> Transition:
     T, G, W = found
     scale = np.outer(unit, unit)
     return Transition(T * unit[:, None] / unit, G * scale, W / scale)
-
-
-def _units(A: Array, S: Array, Q: Array) -> Array:
-    """Return units (nx,) of the states that give rows and columns similar sizes."""
-    # Osborne's balancing; the costates have the inverse units.
-    np.fill_diagonal(A, 0.0)
-    unit = np.ones(len(A))
-    for _ in range(12):
-        drift = A * unit / unit[:, None]
-        outer = np.outer(unit, unit)
-        row, column = drift.sum(axis=1) + (S / outer).sum(1), drift.sum(0) + (Q * outer).sum(0)
-        known = (row > 0.0) & (column > 0.0)
-        unit[known] *= (row[known] / column[known]) ** 0.25
-    return unit
 
 
 # Start and end of an interval, its transitions through the whole, the first half and the second

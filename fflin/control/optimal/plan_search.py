@@ -82,8 +82,8 @@ class Search(NamedTuple):
     parts: int  # number of parts per interval, at whose ends states are limited
     report: Callable[[str], None]  # receives a line of text in each iteration
 
-    def best(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return the knots q, v and the inputs u of least effort, or closest to the end state.
+    def best(self, q: Array, v: Array, u: Array) -> Trial:
+        """Return the trial of least effort, or closest to the end state.
 
         The search begins at the given knots and inputs.
         """
@@ -102,11 +102,11 @@ class Search(NamedTuple):
             self._report(f"iteration {iteration + 1}", trial, limited)
             step = self._step(trial, limited, near, cost * trial.u)
             if step is None:
-                return self._acting(self._flown(trial.u))
+                return self._flown(trial.u)
             z, du, y, outside, at_knots = step
             left.append(at_knots)
             if _stagnates(left):
-                return self._acting(self._flown(trial.u))
+                return self._flown(trial.u)
             # The multipliers determine the penalty on gaps (Powell).
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
@@ -123,7 +123,7 @@ class Search(NamedTuple):
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
                 break
-        return self._acting(self._closed(trial, limited, first, left))
+        return self._closed(trial, limited, first, left)
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the guess, and the largest violation."""
@@ -212,11 +212,6 @@ class Search(NamedTuple):
         """Return the motion from the start under the inputs, as a trial without gaps."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
-
-    def _acting(self, trial: Trial) -> tuple[Array, Array, Array]:
-        """Return q, v and u; if u is held, its last row repeats the input of the last interval."""
-        u = np.vstack((trial.u[:-1], trial.u[-2])) if self.shooting.held else trial.u
-        return trial.q, trial.v, u
 
 
 def _stagnates(left: list[float]) -> bool:

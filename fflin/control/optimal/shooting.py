@@ -69,11 +69,8 @@ class Shooting:
 
         By default, each interval has the number of steps that `refine` found, but at least _STEPS.
         """
-        return self._fly(q[:-1], v[:-1], u[:-1], u[1:], steps or max(self.steps, _STEPS))
-
-    def _fly(self, q: Array, v: Array, first: Array, last: Array, steps: int) -> Motions:
-        """Return the motions of intervals whose inputs change from `first` to `last` (N, nu)."""
-        h, change = self.h[0], 0.0 * first if self.held else last - first
+        q, v, first, steps = q[:-1], v[:-1], u[:-1], steps or max(self.steps, _STEPS)
+        h, change = self.h[0], 0.0 * first if self.held else np.diff(u, axis=0)
         method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
         configurations, speeds, rates = [q], [v], list[Array]()
 
@@ -96,12 +93,11 @@ class Shooting:
 
     def flown(self, start: Point, u: Array) -> Point:
         """Return the knots of the motion from a point under inputs."""
-        rows = [(start[0][None], start[1][None])]
+        q, v = (np.tile(each, (len(u), 1)) for each in start)
         for k in range(len(u) - 1):
-            found = self._fly(*rows[-1], u[k : k + 1], u[k + 1 : k + 2], max(self.steps, _STEPS))
-            rows.append((found.q[:, -1], found.v[:, -1]))
-        q, v = zip(*rows, strict=True)
-        return np.concatenate(q), np.concatenate(v)
+            found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
+            q[k + 1], v[k + 1] = found.q[0, -1], found.v[0, -1]
+        return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
         """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
