@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import warnings
 from collections.abc import Mapping
@@ -59,8 +58,6 @@ _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity", "orbit"),
 )
-
-_log = logging.getLogger("fflin")
 
 
 def sweep(
@@ -183,8 +180,6 @@ def sweep(
         store = FileStore(
             path, task.request, count, size, task.shapes, task.constants, task.texts()
         )
-        if store.resumed:
-            _log.info("resuming from %s", store.part)
     with closing(store), how:
         of_what = "configurations"
         run_chunks(job, task.rows, store, how, progress, of_what=of_what, made=task.batch)
