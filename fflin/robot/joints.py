@@ -78,10 +78,8 @@ class Joint(NamedTuple):
 
     def values(self, q: Array) -> Array:
         """Return this joint's values (..) as in `value` at configurations q (nq, ..)."""
-        at: Array = (
-            np.arctan2(q[self.idx_q + 1], q[self.idx_q]) if self.unbounded else q[self.idx_q]
-        )
-        return at / self.scale
+        at: Array = q[self.idx_q]
+        return np.arctan2(q[self.idx_q + 1], at) if self.unbounded else at / self.scale
 
     def within(self, model: pin.Model) -> Joint:
         """Return this joint with the indices of the joint of the same name in another model."""
