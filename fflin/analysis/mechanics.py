@@ -110,8 +110,6 @@ class SecondOrder:
         R = ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
-        if not r:
-            return np.zeros(0, dtype=complex), margin & other
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
         zeros = unloaded.shape[1] - rigid.shape[1]

@@ -72,8 +72,8 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 
 @contextmanager
-def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
-    """Convert any error in reading a file to one `FileError`; program `by` saved the file."""
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Convert any error in reading a file to one `FileError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
@@ -85,7 +85,7 @@ def reading(path: Path, what: str, by: str = "fflin") -> Iterator[None]:
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise FileError(f"{shown(path)}: does not fit into memory") from None
-        raise FileError(f"{shown(path)}: not a {what} saved by {by} ({reason(error)})") from None
+        raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
 
 
 def require_finite(record: Mapping[str, object]) -> None:

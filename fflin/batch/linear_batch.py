@@ -288,10 +288,8 @@ class LinearBatch(validation.Result):
             )
         from fflin.linear.linearization import Prepared
 
-        common = Prepared(
-            robot, frame=found["frame"], reference=None, moving=found["moving"]
-        ).common
-        return LinearBatch(**found, _asked=common, verified=verified)
+        ready = Prepared(robot, frame=found["frame"], reference=None, moving=found["moving"])
+        return LinearBatch(**found, _asked=ready.common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
         """Return all arrays with one row per point, by name."""
@@ -312,9 +310,8 @@ class LinearBatch(validation.Result):
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
-        rows["x0"] = (
-            self._states_at_rest(rows["q"][None])[0] if self._x0 is None else rows.pop("_x0")
-        )
+        at_rest = self._x0 is None  # x0 then follows from q
+        rows["x0"] = self._states_at_rest(rows["q"][None])[0] if at_rest else rows.pop("_x0")
         rows["y0"] = rows.pop("_y0", rows["x0"])
         if self._reference is None:
             rows["_reference"] = base = rows["q"][:7]

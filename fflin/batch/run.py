@@ -13,7 +13,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from threading import Lock, Thread, local
@@ -57,7 +57,7 @@ class Job(Protocol):
         """Write the results of the rows from `start` on into `out`, and return warnings."""
 
 
-class Execution:
+class Execution(ExitStack):
     """Where the chunks of a call run; a context that ends the worker processes of the call.
 
     The arguments are those of `sweep`; each must be valid, or `InputError` is raised.
@@ -80,16 +80,10 @@ class Execution:
                 whole(name, value, 1)
         if progress is not None and not callable(progress):
             raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
-        self._own = None if workers is None else OwnWorkers(workers)
-        self.executor = self._own or executor
-        self._threads = threads or available_cores()
-
-    def __enter__(self) -> Execution:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._own:
-            self._own.shutdown()
+        super().__init__()
+        self.executor, self._threads = executor, threads or available_cores()
+        if workers is not None:
+            self.executor = self.enter_context(OwnWorkers(workers))
 
     def count(self, job: Job) -> int:
         """Return the number of chunks of a job that are computed at the same time."""
@@ -361,13 +355,12 @@ def _starting() -> Iterator[None]:
 
 def _prepare() -> None:
     """Let a worker process leave Ctrl-C to its parent process, and end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_the_caller, daemon=True).start()
-
-
-def _end_with_the_caller() -> None:
-    """End this process when its parent process ends, even in the middle of a task."""
     caller = parent_process()
     assert caller is not None
-    caller.join()
-    os._exit(1)
+
+    def end_with_the_caller() -> None:  # even in the middle of a task
+        caller.join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=end_with_the_caller, daemon=True).start()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import warnings
 from collections.abc import Mapping
@@ -28,7 +27,6 @@ from fflin.batch.configurations import (
     RandomConfigurations,
     checked_configurations,
     checked_rows,
-    column,
 )
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
@@ -59,8 +57,6 @@ _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity", "orbit"),
 )
-
-_log = logging.getLogger("fflin")
 
 
 def sweep(
@@ -183,8 +179,6 @@ def sweep(
         store = FileStore(
             path, task.request, count, size, task.shapes, task.constants, task.texts()
         )
-        if store.resumed:
-            _log.info("resuming from %s", store.part)
     with closing(store), how:
         of_what = "configurations"
         run_chunks(job, task.rows, store, how, progress, of_what=of_what, made=task.batch)
@@ -393,7 +387,10 @@ class SweepTask:
             rows[key] = frozen(arrays[key].view())
         common = self.job.linearizer.prepared.common
         rows |= {key: common[key] for key in TEXTS}
-        columns = tuple(map(column, self.robot.joints))
+        columns = tuple(
+            (joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale)
+            for joint in self.robot.joints
+        )
         return LinearBatch(**rows, columns=columns, _asked=common)
 
     def texts(self) -> dict[str, str]:

@@ -18,7 +18,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import reading
 from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
-from fflin.base.writing import as_path, check_ending, write_atomically
+from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
 from fflin.campaign.runs import KINDS, kind_named
@@ -383,8 +383,6 @@ class Campaign(FrozenArrays):
             If the file cannot be read, is damaged or does not contain a campaign.
         """
         source = as_path(path)
-        if source.suffix in (".csv", ".mat"):
-            check_ending(source, (".npz", ".h5"))
         with reading(source, "Campaign"):
             arrays, _, texts, _ = read_rows(source, verify=True)
             header = json.loads(texts["header"])

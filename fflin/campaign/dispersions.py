@@ -1,7 +1,7 @@
 """Dispersions: random values by name, and the robots and initial states that follow from them."""
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -16,17 +16,16 @@ from fflin.base.names import by_name, group_of, input_keys
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
-from fflin.campaign.pointing import in_lanes, misaligned, turned
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import batch_tree
-from fflin.robot.equipment.assembly import first_impossible
-from fflin.robot.inputs import JointTorque
-from fflin.robot.joints import ROOT
+from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree, batch_tree
+from fflin.robot.equipment.assembly import first_impossible, turned_to
+from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import bodies_named, properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
@@ -326,7 +325,7 @@ class Dispersions:
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
-            pointed = in_lanes(plant.robot, tree, self._of("misalignment", drawn))
+            pointed = _pointed_lanes(plant.robot, tree, self._of("misalignment", drawn))
             pointed["bodies"] += runs.get("bodies", tree.bodies)
             runs |= pointed
         if self._kinds & {*_OF_SENSORS}:
@@ -363,7 +362,7 @@ class Dispersions:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
-            robot = misaligned(robot, self._of("misalignment", rows)[0])
+            robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if isinstance(policy, Allocation):  # allocates to the nominal directions
                 policy, nominal = copy(policy), bound(policy, plant.robot)
                 vars(policy)["bind"] = lambda _: nominal
@@ -407,3 +406,73 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
     return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
+
+
+def turned(direction: object, angles: Array) -> Array:
+    """Return a direction rotated by angles (N, 2) [rad] about two perpendicular axes, (N, 3)."""
+    first, second, along = turned_to(np.array(direction, dtype=float)).T
+    size = np.linalg.norm(angles, axis=1)[:, None]
+    side = angles[:, 1:] * first - angles[:, :1] * second
+    found: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
+    return found
+
+
+def _misaligned(robot: Robot, angles: Array) -> Robot:
+    """Return a robot whose thrusters and wheels are rotated by angles (nu, 2)."""
+    inputs = list(robot.inputs)
+    for place, item, _, at in _mounted(robot):
+        inputs[place] = _pointed(item, turned(_direction(item), angles[at : at + 1])[0])
+    return robot.replace(inputs=inputs)
+
+
+def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
+    """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
+    model, count, names = robot._bare.model, len(angles), list(robot.model.names)
+    wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
+    stored = np.tile(tree.stored, (count, 1)).reshape(count, -1, 3)
+    fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
+    bodies = np.zeros((count, tree.bodies.size // 10, 10))
+    inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
+    for _, item, own, at in _mounted(robot):
+        joint, placement = find_frame(model, item.frame)
+        body = names.index(model.names[joint]) - ROOT
+        axes = tree.axes[body].T @ placement.rotation
+        before, after = _direction(item), turned(_direction(item), angles[:, at])
+        if at in inputs:
+            forces = [placement.act(pin.Force(_pointed(item, x).wrench)).vector for x in np.eye(3)]
+            columns = np.column_stack(forces)
+            parts = [tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)]
+            wrench[:, inputs.index(at)] += (after - before) @ np.concatenate(parts).T
+        if isinstance(item, ReactionWheel) and item.momentum:
+            stored[:, storing.index(body)] += item.momentum * (after - before) @ axes.T
+        if isinstance(item, ReactionWheel) and item.inertia:
+            wheel = names.index(own[0]) - ROOT
+            fixed[:, wheel, :9] = [(axes @ turned_to(each)).ravel("F") for each in after]
+            a, b = after @ axes.T, axes @ before
+            change = np.outer(b, b) - a[:, :, None] * a[:, None]
+            row, column = np.triu_indices(3)
+            bodies[:, body, 4:] += item.inertia * change[:, row, column]
+    of = {"wrench": wrench, "stored": stored, "fixed": fixed, "bodies": bodies}
+    return {name: each.reshape(count, -1) for name, each in of.items()}
+
+
+def _direction(item: Thruster | ReactionWheel) -> Array:
+    return np.array(item.direction if isinstance(item, Thruster) else item.axis)
+
+
+def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | ReactionWheel:
+    """Return a thruster or wheel with another direction."""
+    if isinstance(item, Thruster):
+        return replace(item, direction=along.tolist())
+    return replace(item, axis=along.tolist())
+
+
+def _mounted(
+    robot: Robot,
+) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int]]:
+    """Yield each thruster and wheel: its index in `inputs`, itself, its names, its index in u."""
+    first = 0
+    for place, (item, names) in enumerate(named_inputs(robot.inputs)):
+        if isinstance(item, Thruster | ReactionWheel):
+            yield place, item, names, first
+        first += len(names)

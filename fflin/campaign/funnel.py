@@ -394,14 +394,10 @@ def _outcomes(
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
     last["level"] = ((e @ P) * e).sum(axis=1)
     stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
-    failures = [stopped, _beyond(largest, within), _beyond(last, final)]
+    failures = [stopped]
+    for sizes, bounds in ((largest, within), (last, final)):
+        failures.append(~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0))
     return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
-
-
-def _beyond(sizes: Mapping[str, Array], bounds: Mapping[str, float]) -> Array:
-    """Return the mask (N,) of runs that exceed a bound."""
-    beyond: Array = ~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0)
-    return beyond
 
 
 def _tested(

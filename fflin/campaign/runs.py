@@ -282,21 +282,17 @@ class CampaignJob:
 
     def seconds(self, first: Array, count: int) -> float:
         """Estimate the time [s] of runs on one core from a few steps of the first runs."""
-        few, plan, drawn = copy(self), self.plan, first[: self.lanes]
+        few, plan, drawn, times = copy(self), self.plan, first[: self.lanes], list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
-
-        def measured(steps: int) -> float:
-            few.plan = plan.replace(times=plan.times._replace(steps=steps))
+        short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
+        for each in (1, short, long):  # the first run compiles the loop if needed
+            few.plan = plan.replace(times=plan.times._replace(steps=each))
             # Other programs may slow down one of the trials.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
-            return min(repeat(timed, timer=perf_counter, repeat=3, number=1))
-
-        short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
-        measured(1)  # compiles the loop if needed
-        begin = measured(short)
-        step = (measured(long) - begin) / (long - short) if long > short else 0.0
-        return (begin + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
+            times.append(min(repeat(timed, timer=perf_counter, repeat=3, number=1)))
+        step = (times[2] - times[1]) / (long - short) if long > short else 0.0
+        return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat a run (k,) with the same arithmetic, and return its motion."""

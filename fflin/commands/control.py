@@ -318,7 +318,8 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str,
     policy, linear, lin = about_point(robot, arguments)
     q, v = start_of(robot, arguments, linear.lin.reference)
     if arguments.duration is None:
-        settings["duration"] = time_to_settle(robot, linear, q, v)
+        design = policy.design if isinstance(policy, fflin.Allocation) else robot
+        settings["duration"] = time_to_settle(design, linear, q, v)
     return policy, settings | {"q0": q, "v0": v, "linear": lin}
 
 
@@ -381,17 +382,17 @@ def about_point(
 
 def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
     """Return the predictive controller with the weights and limits of the arguments."""
+    from fflin.control.default_weights import Pace
     from fflin.control.mpc import Mpc
     from fflin.control.weights import rule_weights
 
     if (sample := arguments.sample) is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    settings = {"horizon": arguments.horizon, "dt": sample, "limits": limits_of_options(arguments)}
-    if given := weights_of(arguments):
-        Q, R, _, _ = rule_weights(lin.discretize(sample), arguments.weights, given)
-        by = fflin.mpc(lin, Q, R, **settings)
-    else:
-        by = fflin.mpc(lin, weights=arguments.weights, **settings)
+    # These are weights of the integral, but the rule depends on the sample time.
+    given = weights_of(arguments)
+    Q, R, *_ = rule_weights(lin, arguments.weights, given, pace=Pace(hold=sample))
+    limits = limits_of_options(arguments)
+    by = fflin.mpc(lin, Q, R, horizon=arguments.horizon, dt=sample, limits=limits)
     assert isinstance(by, Mpc)  # since the model is about a point
     return by
 

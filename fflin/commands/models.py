@@ -39,25 +39,23 @@ def robots(_: Namespace) -> Report:
     example: fflin robots
     """
     from fflin.robot.catalog import find_robot
-    from fflin.robot.summary import robot_list
 
-    entries: list[tuple[str, fflin.Robot | str, str]] = []
+    rows, notes, result = [["name", "n", "mass [kg]", "from"]], [], dict[str, object]()
     for name in fflin.list_robots():
         found = find_robot(name)
-        robot: fflin.Robot | str
         try:
             with warnings.catch_warnings():
                 # Do not show these warnings here; `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 robot = fflin.load(name)
+            rows.append([name, str(robot.n), f"{robot.mass:.6g}", found.origin])
+            result[name] = {"n": robot.n, "mass": robot.mass}
         except FflinError as error:
-            robot = str(error).replace(f"{found.path.parent}{os.sep}", "")
-        entries.append((name, robot, found.origin))
-    result = {
-        name: {"error": of} if isinstance(of, str) else {"n": of.n, "mass": of.mass}
-        for name, of, _ in entries
-    }
-    return Report(None, {"robots": result}, robot_list(entries))
+            reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
+            notes.append(folded([f"{name} does not load: {reason}"]))
+            result[name] = {"error": reason}
+    head = f"{len(rows) - 1} robots can be loaded by name; {len(notes)} cannot be loaded"
+    return Report(None, {"robots": result}, "\n\n".join((head, grid(rows, "lrrl"), *notes)))
 
 
 def info(arguments: Namespace) -> Report:

@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -27,9 +28,12 @@ from fflin.linear.fit import require_same
 from fflin.linear.linear_trajectory import LinearTrajectory, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
-from fflin.linear.trajectory import Trajectory, cubic
+from fflin.linear.trajectory import Trajectory
 from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,16 +149,16 @@ class GainSchedule(Schedule):
         k = self.interval(t)
         if self.dt:
             return self.P[k]
-        fraction = (t - self.t[k]) / (self.t[k + 1] - self.t[k])
-        P: Array = np.tensordot(fraction ** np.arange(4), self._cubics[k], 1)
+        P: Array = self._cubics(t)
         return P
 
     @cached_property
-    def _cubics(self) -> Array:
-        """Coefficients (M - 1, 4, nx, nx) of P, for powers of the elapsed fraction."""
-        P, drift, spent = self.P, self.P @ self.A, self.K.mT @ self.R @ self.K
-        rate, h = spent - drift - drift.mT - self.Q, np.diff(self.t)[:, None, None]
-        return cubic(P[:-1], P[1:], h * rate[:-1], h * rate[1:])
+    def _cubics(self) -> CubicHermiteSpline:
+        """P (nx, nx) as a function of time: cubics that match P and dP/dt at the knots."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        drift, spent = self.P @ self.A, self.K.mT @ self.R @ self.K
+        return CubicHermiteSpline(self.t, self.P, spent - drift - drift.mT - self.Q)
 
     @cached_property
     def pieces(self) -> Array:
@@ -162,19 +166,17 @@ class GainSchedule(Schedule):
         from scipy.interpolate import CubicSpline
 
         # Between knots, P is a cubic and B is a spline, and K = R^-1 B' P.
-        powers = self._cubics / np.diff(self.t)[:, None, None, None] ** np.arange(4)[:, None, None]
         of_B = CubicSpline(self.t, self.B).c[::-1]
         pieces = np.zeros((7, *of_B[0].mT.shape))
         for power, reach in enumerate(np.linalg.solve(self.R, of_B.mT)):
-            pieces[power : power + 4] += reach @ powers.swapaxes(0, 1)
+            pieces[power : power + 4] += reach @ self._cubics.c[::-1]
         return pieces.swapaxes(0, 1).reshape(len(self.t) - 1, 7, -1)
 
     def defect(self, at: Callable[[Array], riccati.Coefficients]) -> float:
         """Return the largest relative residual of the differential equation between knots."""
-        h, (first, second, third, fourth) = np.diff(self.t), self._cubics.swapaxes(0, 1)
-        P = first + 0.5 * second + 0.25 * third + 0.125 * fourth
-        rate = (second + third + 0.75 * fourth) / h[:, None, None]
-        A, S, Q = at(self.t[:-1] + 0.5 * h)
+        middle = 0.5 * (self.t[:-1] + self.t[1:])
+        P, rate = self._cubics(middle), self._cubics(middle, 1)
+        A, S, Q = at(middle)
         drift = P @ A
         return riccati.imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, rate)))
 

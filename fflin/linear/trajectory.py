@@ -142,8 +142,10 @@ class Trajectory(Design):
                 q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-        hold = self.hold or ("previous" if short else "linear")
-        vars(self).update(t=times, q=frozen(q), v=frozen(v), u=frozen(u), hold=hold)
+        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
+        values["hold"] = self.hold or ("previous" if short else "linear")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
         super().__post_init__()
 
     def __repr__(self) -> str:

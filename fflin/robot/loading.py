@@ -392,14 +392,14 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file; see `load_inputs`."""
     inputs: list[Input] = []
     for index, table in enumerate(_tables(document, "input")):
-        kind, values = str(table.get("type")), {**table}
+        values = {**table}
+        kind = str(values.pop("type", ""))
         if "type" not in table:
             problem = f"input {index + 1}: the key 'type' is missing; set 'type' to one of "
             raise document.error(problem + ", ".join(_TYPES), "input", index)
         if kind not in _TYPES:
             problem = f"input {index + 1}: no valid 'type': {unknown('type', kind, _TYPES)}"
             raise document.error(UnknownNameError(problem), "input", index, "type")
-        del values["type"]
         inputs.append(_built(document, ("input", index), _TYPES[kind], values))
     if not inputs:
         message = "the file contains no inputs; add a table [[input]] with its type"

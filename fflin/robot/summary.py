@@ -1,9 +1,9 @@
-"""Text about a robot: the list of robots, a summary, and the draft of a robot file."""
+"""Text about a robot: a summary, and the draft of a robot file."""
 
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from string import Template
 from textwrap import fill
 
@@ -25,18 +25,6 @@ _LOOKS = {
 
 # Frequency [rad/s] and damping ratio that a draft suggests for joints without a motor.
 _SWING, _DAMPED = math.pi, 0.01
-
-
-def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
-    """Return a table of robots from entries (name, robot or error message, origin)."""
-    rows, notes = [["name", "n", "mass [kg]", "from"]], []
-    for name, robot, origin in entries:
-        if isinstance(robot, str):
-            notes.append(folded([f"{name} does not load: {robot}"]))
-        else:
-            rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
-    head = f"{len(rows) - 1} robots can be loaded by name; {len(notes)} cannot be loaded"
-    return "\n\n".join((head, grid(rows, "lrrl"), *notes))
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:

@@ -182,7 +182,8 @@ class Plan:
     def replace(self, **changes: object) -> Plan:
         """Return the plan with other attributes."""
         other = copy(self)
-        vars(other).update(changes)
+        for name, value in changes.items():
+            setattr(other, name, value)
         return other
 
     def channel(self, law: Callable[..., Array], speeds: Callable[..., Array]) -> Channel:

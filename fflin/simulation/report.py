@@ -305,15 +305,11 @@ def motion_record(motion: Motion) -> dict[str, object]:
     """Return the numbers of the report by name."""
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
-    columns = ErrorSize._fields[1:6]
-    errors = {
-        each.title: dict(zip(columns, each[1:6], strict=True)) for each in error_sizes(motion)
-    }
     return {
         **{name: getattr(motion, name) for name in own},
         "duration": t[-1],
         "rows": len(t),
-        "errors": errors,
+        "errors": {each.title: each for each in error_sizes(motion)},
         "x": motion.x[-1],
         "largest_inputs": np.abs(motion.u).max(axis=0),
         "limits_exceeded": motion.passed,

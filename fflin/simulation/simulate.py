@@ -18,6 +18,7 @@ from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
+from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
@@ -29,7 +30,11 @@ from fflin.simulation.run import Conserved, Disturbance, Recording, go
 # In the deviation, the robot's states come first, then those of a continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop.
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
+# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
+# once.
+_FRACTION, _COMPILING = 0.1, 30.0
+
 _log = logging.getLogger("fflin")
 
 
@@ -200,7 +205,9 @@ def simulate(
     try:
         run = recorded(plan) if compiled else go(plan, hint)
         if hint and (spent := perf_counter() - began) > LONG_RUN:
-            _log.warning("fflin: a simulation took %.0f s in Python %s", spent, hint)
+            once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
+            said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
+            _log.warning(f"fflin: {said} would take about %.0f s%s", spent, _FRACTION * spent, once)
         return motion_of(plan, run, foresees)
     except MemoryError:
         raise InputError(

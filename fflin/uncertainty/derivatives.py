@@ -167,10 +167,8 @@ class ModelDerivatives:
             return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
 
         (dA, dB, *_), worst = self.over([one]), 0.0
-        for *stepped, now, exact in zip(
-            *map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True
-        ):
-            far, near, nearer, farther = stepped
+        values = zip(*map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True)
+        for far, near, nearer, farther, now, exact in values:
             by_steps = (far - 8.0 * near + 8.0 * nearer - farther) / (12.0 * step)
             size = max(np.abs(by_steps).max(), _LEAST * np.abs(now).max() / step)
             worst = max(worst, float(np.abs(by_steps - exact).max() / size))

@@ -102,9 +102,8 @@ class LFT(Design):
 
     def _report(self) -> str:
         rows = [("parameter", "unit", "least", "largest", "repeated")]
-        for name, unit, middle, half, repeats in zip(
-            self.parameters, self.units, self.middle, self.half, self.repeats, strict=True
-        ):
+        columns = self.parameters, self.units, self.middle, self.half, self.repeats
+        for name, unit, middle, half, repeats in zip(*columns, strict=True):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
         many, count = counted(len(self.repeats), "parameter"), f"{self.repeats.sum():g}"

@@ -103,16 +103,10 @@ class Worst:
         ):
             at = ", ".join(f"{name} {value:.4g}" for name, value in found.parameters.items())
             lines.append(f"{what} {found.value:.4g} at {at}")
+        where = f"the central {100.0 * self.safe:.3g} % of each range"
         if self.safe >= 1.0:
-            lines.append(
-                f"guaranteed stable in all ranges, and in ranges that are {self.safe:.3g} times as "
-                "wide"
-            )
-        else:
-            lines.append(
-                f"guaranteed stable in the central {100.0 * self.safe:.3g} % of each range"
-            )
-        return folded(lines)
+            where = f"all ranges, and in ranges that are {self.safe:.3g} times as wide"
+        return folded([*lines, f"guaranteed stable in {where}"])
 
 
 @in_one_thread

@@ -144,7 +144,9 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
                 browser = _Browser(process)
                 yield browser
                 with suppress(_BrowserError, subprocess.TimeoutExpired):
-                    browser.quit()
+                    # Unlike a killed browser, a closed one removes its temporary files.
+                    browser.session = {}
+                    browser.tell("Browser.close")
                     process.wait(5.0)
             finally:
                 timer.cancel()
@@ -169,16 +171,16 @@ class _Browser:
         self._commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
-        # All further commands are sent to one tab.
-        self._session: dict[str, str] = {}
+        # All further commands are sent to one tab, unless this is empty.
+        self.session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
-        self._session = {"sessionId": attached["sessionId"]}
+        self.session = {"sessionId": attached["sessionId"]}
 
     def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
         self._number += 1
-        command = {"id": self._number, "method": method, "params": parameters, **self._session}
+        command = {"id": self._number, "method": method, "params": parameters, **self.session}
         with suppress(BrokenPipeError):  # reading the answer reports the error
             self._commands.write(json.dumps(command).encode() + b"\0")
         answer: dict[str, Any] = {}
@@ -194,11 +196,6 @@ class _Browser:
             raise _BrowserError(answer["error"].get("message"))
         result: dict[str, Any] = answer["result"]
         return result
-
-    def quit(self) -> None:
-        """Ask the browser to quit; unlike a killed browser, it then removes its temporary files."""
-        self._session = {}
-        self.tell("Browser.close")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript, or of its promise."""

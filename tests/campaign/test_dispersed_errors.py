@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.campaign.campaign import ARRAYS
-from fflin.campaign.pointing import turned
+from fflin.campaign.dispersions import turned
 from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import CampaignJob
 from fflin.robot.equipment.assembly import turned_to

@@ -218,6 +218,30 @@ def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, opti
     assert says(other, "gain.npz", "'ets_vii'", "'canadarm2'")
 
 
+def test_a_gain_about_the_world_feeds_back_the_state_that_it_was_designed_for(tmp_path):
+    """Its columns belong to an attitude and a position from the world, not from its own point."""
+    world = ("--reference", "world", "--weights", "identity", "-o", "gain.npz")
+    pose = ("--rpy", 40, 30, 20, "--position", 1, 2, 3)
+    assert run("lqr", "cubesat", *pose, *world, cwd=tmp_path)[0] == 0
+    start = ("--rpy", 55, 20, 20, "--position", 1.1, 2, 3)
+    run(
+        "simulate",
+        "cubesat",
+        *start,
+        "--gain",
+        "gain.npz",
+        "--duration",
+        1,
+        "-o",
+        "m.npz",
+        cwd=tmp_path,
+    )
+    gain, motion = fflin.Gain.load(tmp_path / "gain.npz"), fflin.Motion.load(tmp_path / "m.npz")
+    state = fflin.StateMap(fflin.load("cubesat"))
+    x = state.to_state(motion.q[0], motion.v[0])
+    np.testing.assert_allclose(motion.u[0], gain.u0 - gain.K @ (x - gain.x0), rtol=1e-9, atol=1e-12)
+
+
 def test_gains_of_thrusters_say_that_nothing_is_allocated(tmp_path):
     thruster = '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0.1, 0, 0]\n'
     base = '[[input]]\ntype = "base_torque"\n[[input]]\ntype = "base_force"\n'

@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.inputs import named_inputs
 from tests.support.complex_crba import inertia, motions
 from tests.support.messages import says
 from tests.support.orbits import in_orbit
@@ -142,7 +143,7 @@ def test_springs_dampers_thrusters_and_wheels():
         return with_input(thrusters[1], position=np.add(item.position, (0.0, 0.0, size)))
 
     names = fflin.linearize(robot).input_names
-    first = names.index(inputs[thrusters[0]].names(1)[0])
+    first = names.index(named_inputs(inputs)[thrusters[0]][1][0])
     wheel = inputs[wheels[0]].name
     K, D = robot.stiffness[hinge], robot.damping[hinge]
     cases = {

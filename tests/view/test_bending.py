@@ -10,8 +10,7 @@ import pytest
 import fflin
 from fflin.robot.robot import ROOT
 from fflin.view.page import Page, body_poses
-from fflin.view.pages import mode_page
-from fflin.view.panel import panel
+from fflin.view.pages import mode_page, panel
 from fflin.view.shapes import shapes
 
 

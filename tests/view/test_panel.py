@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.view.page import subtitle
-from fflin.view.panel import errors, panel
+from fflin.view.pages import errors, panel
 from tests.support.motions import led, settling
 from tests.support.robots import random_pose
 
