@@ -260,13 +260,8 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
     q = np.tile(start, (count, 1))
     for name, column in values.items():
         robot.joint(name).place(q.T, column)
-    follow_rows(robot, q)
+    robot.follow(q.T)
     return q
-
-
-def column(joint: Joint) -> Column:
-    """Return the `Column` of a joint: its indices in q and its factor."""
-    return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale
 
 
 def values(q: Array, column: Column) -> Array:
@@ -290,12 +285,6 @@ def away(q: Array, column: Column, value: float) -> Array:
     return np.abs(distance)
 
 
-def follow_rows(robot: Robot, q: Array) -> None:
-    """Set the mimic joints of configurations (N, nq) from the joints that they follow."""
-    for joint, leader, multiplier, offset in robot.followers:
-        joint.place(q.T, multiplier * values(q, column(leader)) + offset)
-
-
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
     """Return a copy of configurations (N, nq) after `Robot.checked_configuration` of each row."""
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
@@ -311,13 +300,13 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
-            follow_rows(robot, followed)
+            robot.follow(followed.T)
             doubtful |= ~(np.abs(followed - block) <= validation.NORM_TOLERANCE).all(axis=1)
         for row in np.flatnonzero(doubtful).tolist():
             with located(f"configuration {start + row}"):
                 block[row] = robot.checked_configuration(block[row])
         if robot.followers:
-            follow_rows(robot, block)
+            robot.follow(block.T)
     return frozen(rows)
 
 

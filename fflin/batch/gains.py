@@ -12,7 +12,6 @@ from fflin.base.errors import InputError, located
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, Vector, instance, vector
-from fflin.batch.configurations import column, positions
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
 from fflin.control.lqr import lqr
@@ -242,10 +241,10 @@ class ScheduledFeedback(Feedback):
         """Return policy(t, q, v) -> u for a robot; see `StateFeedback.bind` for errors."""
         lin, gains = self.lin, self.gains
         state = self.state_map(robot)
-        columns = [column(robot.joint(name)) for name in gains.joint_names]
+        joints = [robot.joint(name) for name in gains.joint_names]
 
         def policy(_: float, q: Array, v: Array) -> Array:
-            K = gains._between(positions(q[None], columns)[0])
+            K = gains._between(np.array([joint.values(q) for joint in joints]))
             u: Array = lin.u0 - K.dot(state.to_state(q, v, near=lin.x0) - lin.x0)
             return u
 

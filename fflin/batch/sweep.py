@@ -27,7 +27,6 @@ from fflin.batch.configurations import (
     RandomConfigurations,
     checked_configurations,
     checked_rows,
-    column,
 )
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
@@ -388,7 +387,10 @@ class SweepTask:
             rows[key] = frozen(arrays[key].view())
         common = self.job.linearizer.prepared.common
         rows |= {key: common[key] for key in TEXTS}
-        columns = tuple(map(column, self.robot.joints))
+        columns = tuple(
+            (joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale)
+            for joint in self.robot.joints
+        )
         return LinearBatch(**rows, columns=columns, _asked=common)
 
     def texts(self) -> dict[str, str]:

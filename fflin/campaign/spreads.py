@@ -29,9 +29,7 @@ _EXPECTED = (
 class DispersionFile(dict[str, object]):
     """{name, group or pattern: spread} from a file, with the file's line numbers."""
 
-    def __init__(self, document: TomlFile) -> None:
-        super().__init__()
-        self.document = document
+    document: TomlFile
 
 
 def placed(dispersions: object) -> AbstractContextManager[None]:
@@ -99,7 +97,8 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
                 problem = f"{kind} '{key}' is outside [{_TABLE}], the only table of this file"
             problem = f"{problem}; write [{_TABLE}] and below it q_b = 0.05"
             raise document.error(UnknownNameError(problem), key)
-    found = DispersionFile(document)
+    found = DispersionFile()
+    found.document = document
     for name, value in _names(table or {}):
         try:
             found[name] = _spread(value)

@@ -132,17 +132,15 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
     # largest principal moment, and its mass times the squared length of the path to it. The path
     # runs from joint to joint, with prismatic joints within `STROKE`.
-    joints, inertias = model.joints.tolist(), model.inertias.tolist()
-    placements, parents = model.jointPlacements.tolist(), model.parents.tolist()
-    slides, distances = [False] * len(joints), [0.0] * len(joints)
-    masses, moments = [0.0] * len(joints), [0.0] * len(joints)
-    for index, item in enumerate(inertias):
+    joints, parents = model.joints.tolist(), model.parents.tolist()
+    kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
+    if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
+        return None
+    distances, masses, moments = ([0.0] * len(joints) for _ in range(3))
+    for index, item in enumerate(model.inertias.tolist()):
         if index > ROOT:
-            kind = joints[index].shortname()[:11]
-            if kind not in ("JointModelR", "JointModelP"):
-                return None
-            slides[index] = kind == "JointModelP"
-            step = float(np.linalg.norm(placements[index].translation)) + STROKE * slides[index]
+            step = float(np.linalg.norm(model.jointPlacements[index].translation))
+            step += STROKE if kinds[index] == "JointModelP" else 0.0
             distances[index] = distances[parents[index]] + step
         masses[index] = item.mass
         # The largest row sum of an inertia matrix is a bound of its largest principal moment.
@@ -150,8 +148,9 @@ def inertia_bounds(model: pin.Model) -> Array | None:
         arm = distances[index] + float(np.linalg.norm(item.lever))
         moments[index] = item.mass * arm**2 + turning
     bounds: Array = np.empty(model.nv)
-    for index in range(len(joints) - 1, 1, -1):
-        bounds[joints[index].idx_v] = masses[index] if slides[index] else moments[index]
+    for index in range(len(joints) - 1, ROOT, -1):
+        moved = masses if kinds[index] == "JointModelP" else moments
+        bounds[joints[index].idx_v] = moved[index]
         masses[parents[index]] += masses[index]
         moments[parents[index]] += moments[index]
     bounds[:3], bounds[3:6] = masses[1], moments[1]

@@ -57,22 +57,51 @@ _ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
 ALLOCATION = Struct(Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES)
 
 
-# For arrays of numbers. Compiled code uses the loops in `LOOPS` in place of NumPy.
+def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
+    total = 0.0
+    for index in range(count):
+        total += a[first + index] * b[second + index]
+    return total
+
+
+@vec.compiled_as(_row_product)
 def row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
     """Return the scalar product of `count` entries of two arrays of numbers."""
     return a[first : first + count].dot(b[second : second + count])
 
 
+def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: int) -> None:
+    for index in range(count):
+        a[first + index] += share * b[second + index]
+
+
+@vec.compiled_as(_add_row)
 def add_row(a: Array, first: int, factor: float, b: Array, second: int, count: int) -> None:
     """Add `factor` times `count` entries of b, from `second` on, to entries of a."""
     a[first : first + count] += factor * b[second : second + count]
 
 
+def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
+    for index in range(len(out)):
+        out[index] = _row_product(a, index * size, b, 0, size)
+
+
+@vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
     """Write the scalar product of each row of `size` entries of a with the first entries of b."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
+def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
+    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
+    # the least squares solution is as accurate as with Householder's method.
+    for index in range(count):
+        share = _row_product(Q, index * size, x, 0, size)
+        _add_row(x, 0, -share, Q, index * size, size)
+        found[first + index] = share
+
+
+@vec.compiled_as(_remove_components)
 def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
     """Make x orthogonal to the first `count` rows of Q, and write its components along them."""
     basis = Q[: count * size].reshape(count, size)
@@ -85,54 +114,15 @@ def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, f
     np.add(components, rest, found[first : first + count])
 
 
-def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None:
-    """Write `factor` times the first entries of one lane of `source` into `target`."""
-    target[:] = factor * source[: len(target)]
-
-
-@called
-def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
-    total = 0.0
-    for index in range(count):
-        total += a[first + index] * b[second + index]
-    return total
-
-
-@called
-def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: int) -> None:
-    for index in range(count):
-        a[first + index] += share * b[second + index]
-
-
-@called
-def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    for index in range(len(out)):
-        out[index] = _row_product(a, index * size, b, 0, size)
-
-
-@called
-def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
-    # the least squares solution is as accurate as with Householder's method.
-    for index in range(count):
-        share = _row_product(Q, index * size, x, 0, size)
-        _add_row(x, 0, -share, Q, index * size, size)
-        found[first + index] = share
-
-
-@called
 def _write_scaled(source: Array, lane: int, share: float, target: Array) -> None:
     for index in range(len(target)):
         target[index] = share * vec.peek(source, index, lane)
 
 
-vec.LOOPS |= {
-    row_product: _row_product,
-    row_products: _row_products,
-    add_row: _add_row,
-    remove_components: _remove_components,
-    write_scaled: _write_scaled,
-}
+@vec.compiled_as(_write_scaled)
+def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None:
+    """Write `factor` times the first entries of one lane of `source` into `target`."""
+    target[:] = factor * source[: len(target)]
 
 
 def least_squares(least, most, size):

@@ -90,7 +90,7 @@ def inwards(work, tree):
         place = places + body * PLACE
         z = vec.get3(work, place + 6)
         axis = vec.times(z, tree.turns[body]), vec.times(z, tree.slides[body])
-        wrench = spatial_inertia_times(work, at, axis)
+        moment, force = spatial_inertia_times(work, at, axis)
         # Add the composite inertia, expressed at the parent's joint, to the parent's inertia.
         m, h, d = load(work, at), vec.get3(work, at + 1), vec.get3(work, place + 9)
         (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
@@ -107,13 +107,14 @@ def inwards(work, tree):
         while above > 0:
             place = places + above * PLACE
             z = vec.get3(work, place + 6)
-            value = tree.turns[above] * vec.dot(z, wrench[0])
-            value = value + tree.slides[above] * vec.dot(z, wrench[1])
+            value = tree.turns[above] * vec.dot(z, moment)
+            value = value + tree.slides[above] * vec.dot(z, force)
             vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
             pair += 1
-            wrench = at_parent(work, place, wrench)
+            moment, force = at_parent(work, place, (moment, force))
             above = tree.parent[above]
-        vec.add6(work, packed + tree.target[pair], vec.times6(wrench, tree.share[pair]))
+        row = vec.times6((moment, force), tree.share[pair])
+        vec.add6(work, packed + tree.target[pair], row)
         pair += 1
     # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
     m = load(work, inertias)
@@ -281,10 +282,10 @@ def collect_momenta(work, tree):
         # The matrix of second moments of mass is tr(I) / 2 times the identity, minus I.
         (xx, xy, xz), (yy, yz, zz) = vec.get6(work, own + 4)
         trace = 0.5 * (xx + yy + zz)
-        x, y, z = (trace - xx, -xy, -xz), (-xy, trace - yy, -yz), (-xz, -yz, trace - zz)
-        vec.put3(work, at + MOMENTS, vec.plus(vec.times(v, h[0]), vec.cross(w, x)))
-        vec.put3(work, at + MOMENTS + 3, vec.plus(vec.times(v, h[1]), vec.cross(w, y)))
-        vec.put3(work, at + MOMENTS + 6, vec.plus(vec.times(v, h[2]), vec.cross(w, z)))
+        second = (trace - xx, -xy, -xz), (-xy, trace - yy, -yz), (-xz, -yz, trace - zz)
+        for axis in range(3):
+            column = vec.plus(vec.times(v, h[axis]), vec.cross(w, second[axis]))
+            vec.put3(work, at + MOMENTS + 3 * axis, column)
         vec.put3(work, at + STORED, (zero, zero, zero))
         vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
     for index in range(len(tree.stored_body)):

@@ -86,11 +86,9 @@ def _alike(builder: ir.IRBuilder, *values: ir.Value) -> Sequence[ir.Value]:
     return values
 
 
-def _together(*kinds: Type) -> Type:
-    """Return the common type of numbers, or None if one of them is not a number."""
-    if any(kind not in (lanes, float64) for kind in kinds):
-        return None
-    return lanes if lanes in kinds else float64
+def _together(*kinds: Type) -> Signature:
+    """Return the signature of an operation whose result has lanes if one of the numbers has."""
+    return (lanes if lanes in kinds else float64)(*kinds)
 
 
 def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
@@ -195,7 +193,7 @@ _rounding(uncompiled.whole, "rint")
 _rounding(uncompiled.root, "sqrt")
 
 
-@_operation(uncompiled.chosen, lambda *kinds: _together(*kinds)(*kinds))
+@_operation(uncompiled.chosen, _together)
 def _chosen(
     builder: ir.IRBuilder, left: ir.Value, right: ir.Value, less: ir.Value, other: ir.Value
 ) -> ir.Value:
@@ -213,7 +211,7 @@ def _below(builder: ir.IRBuilder, value: ir.Value, bound: ir.Value) -> ir.Value:
     return builder.icmp_signed("==", builder.bitcast(less, bits), ir.Constant(bits, -1))
 
 
-@_operation(uncompiled.angle, lambda *kinds: _together(*kinds)(*kinds))
+@_operation(uncompiled.angle, _together)
 def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
     kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
     atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")

@@ -35,18 +35,27 @@ HOW: dict[Callable[..., object], str] = {}
 LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
-def _decorator(how: str) -> Callable[[F], F]:
+def called(function: F) -> F:
+    """Decorate a function that is rarely called: it is not inlined, which would take long."""
+    HOW[function] = "called"
+    return function
+
+
+def compiled(function: F) -> F:
+    """Decorate a function that Python calls; its machine code is stored on disk."""
+    HOW[function] = "compiled"
+    return function
+
+
+def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
+    """Decorate a function that uses NumPy; compiled code calls a loop in its place."""
+
     def noted(function: F) -> F:
-        HOW[function] = how
+        LOOPS[function] = called(loop)
         return function
 
     return noted
 
-
-# For functions that are rarely called: inlining saves little there, and takes long to compile.
-called = _decorator("called")
-# For functions called from Python; their machine code is stored on disk.
-compiled = _decorator("compiled")
 
 floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
 

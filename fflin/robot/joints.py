@@ -74,9 +74,12 @@ class Joint(NamedTuple):
 
     def value(self, q: Array) -> float:
         """Return this joint's value [rad|m|kg^0.5 m]; continuous joints are in (-pi, pi]."""
-        if self.unbounded:
-            return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
-        return float(q[self.idx_q]) / self.scale
+        return float(self.values(q))
+
+    def values(self, q: Array) -> Array:
+        """Return this joint's values (..) as in `value` at configurations q (nq, ..)."""
+        at: Array = q[self.idx_q]
+        return np.arctan2(q[self.idx_q + 1], at) if self.unbounded else at / self.scale
 
     def within(self, model: pin.Model) -> Joint:
         """Return this joint with the indices of the joint of the same name in another model."""
@@ -189,9 +192,9 @@ class Coordinates:
         return q
 
     def follow(self, q: Array) -> None:
-        """Write the values of mimic joints, which follow their leaders, into q (nq,)."""
+        """Write the values of mimic joints, which follow their leaders, into q (nq, ..)."""
         for joint, leader, multiplier, offset in self.followers:
-            joint.place(q, multiplier * leader.value(q) + offset)
+            joint.place(q, multiplier * leader.values(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
         """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""

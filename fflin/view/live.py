@@ -51,24 +51,16 @@ class Live:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        q: Array,
-        *,
-        scene: str,
-        tool: str | None,
-        follow: bool | None,
-        speed: float,
-        port: int,
-        frame: str | None,
+        self, page: Page, q: Array, *, follow: bool | None, speed: float, port: int
     ) -> None:
+        robot = page.robot
         self.robot, self._speed = robot, speed
         self._state_map, self._ranges = StateMap(robot), _ranges(robot)
         self._lock = threading.Lock()
         # Clock time and simulation time [s] at the beginning of the shown simulation.
         self._began: tuple[float, float] | None = None
         self._running, self._state, self._clients = False, "{}", set[_Socket]()
-        self._page = page = Page(robot, scene, tool, frame, self._send)
+        self._page, page.window.forward = page, self._send
         self.meshcat, self.notes = page.meshcat, page.drawing.notes
         poses = body_poses(robot, q)
         page.set_stage(poses, subtitle(robot))

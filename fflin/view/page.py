@@ -268,7 +268,7 @@ class Recorder:
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
-        self._forward = forward
+        self.forward = forward
         # {path: {"set_object": ..., "set_transform": ..., "set_property visible": ...}}
         self._nodes: dict[str, dict[str, Lowered]] = {}
         self._animation: Lowered | None = None
@@ -291,8 +291,8 @@ class Recorder:
         elif kind != "capture_image":
             key = f"{kind} {lowered.get('property', '')}"
             self._nodes.setdefault(path, {})[key] = lowered
-        if self._forward:
-            self._forward(umsgpack.packb(lowered))
+        if self.forward:
+            self.forward(umsgpack.packb(lowered))
 
     def commands(self) -> Iterator[bytes]:
         """Yield the messages with which meshcat's page builds the recorded scene."""
@@ -324,16 +324,9 @@ class Page:
     `entries` begins with the entries of the stage, which follow from the poses of the first frame.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        scene: str,
-        tool: str | None,
-        frame: str | None,
-        forward: Callable[[bytes], None] | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, scene: str, tool: str | None, frame: str | None) -> None:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
-        self.window, self._sent = Recorder(forward), set[str]()
+        self.window, self._sent = Recorder(), set[str]()
         self.meshcat = Visualizer(window=self.window)
         self.drawing = self.draw(robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints from 1 on.

@@ -167,11 +167,11 @@ def visualize(
         port = whole("port", port, 0, 2**16 - 1)
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
+        from fflin.view.page import Page
 
         pace = positive("speed", 1.0 if speed is None else speed)
-        live = Live(
-            robot, start, scene=scene, tool=tool, follow=follow, speed=pace, port=port, frame=frame
-        )
+        page = Page(robot, scene, tool, frame)
+        live = Live(page, start, follow=follow, speed=pace, port=port)
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
