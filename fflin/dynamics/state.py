@@ -379,9 +379,7 @@ class Actuation:
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self.state, self._model = state, robot.model
-        names: list[str] = []
-        units: list[str] = []
-        groups: list[str] = []
+        signals: list[tuple[str, str, str]] = []  # name, unit and group of each input
         columns: list[Array] = []
         held: list[slice] = []
         # Thrusters and wheels without a joint of their own. {joint on which they are mounted:
@@ -408,9 +406,8 @@ class Actuation:
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            names += own
-            units += [unit] * len(own)
-            groups += [item.GROUP] * len(own)
+            signals += [(name, unit, item.GROUP) for name in own]
+        names, units, groups = ([signal[k] for signal in signals] for k in range(3))
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from itertools import product
 from types import FunctionType, ModuleType
 from typing import NamedTuple, Protocol, TypeAlias
@@ -33,7 +33,6 @@ from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.datamodel import DataModelManager
 from numba.core.dispatcher import _CompileStats
 from numba.core.typing import BaseContext as TypingContext
 from numba.core.typing import Signature, make_concrete_template
@@ -64,10 +63,7 @@ class Lanes(Type):
 lanes = Lanes()
 
 
-@extending.register_model(Lanes)
-class _LanesModel(extending.models.PrimitiveModel):
-    def __init__(self, manager: DataModelManager, kind: Lanes) -> None:
-        super().__init__(manager, kind, _VECTOR)
+extending.register_model(Lanes)(partial(extending.models.PrimitiveModel, be_type=_VECTOR))
 
 
 def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
@@ -312,10 +308,8 @@ def _numba_type(kind: Kind | Struct[NamedTuple]) -> Type:
     return Array(number, kind.axes, "C") if kind.axes else number
 
 
-@extending.register_model(_StructType)
-class _StructModel(extending.models.PrimitiveModel):
-    def __init__(self, manager: DataModelManager, kind: _StructType) -> None:
-        super().__init__(manager, kind, _WORD.as_pointer())
+_struct_model = partial(extending.models.PrimitiveModel, be_type=_WORD.as_pointer())
+extending.register_model(_StructType)(_struct_model)
 
 
 @extending.infer_getattr
