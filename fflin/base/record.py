@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fflin.base.errors import FileError, InputError
+from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.validation import Result
 from fflin.base.writing import (
     as_path,
@@ -78,7 +78,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
             yield
-    except FileError:
+    except (FileError, MissingPackageError):
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: No such file{missing(path)}") from None

@@ -1,7 +1,7 @@
 """Dispersions: random values by name, and the robots and initial states that follow from them."""
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -23,6 +23,7 @@ from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree, batch_tree
+from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs
 from fflin.robot.joints import ROOT, find_frame
@@ -364,12 +365,19 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if isinstance(policy, Allocation):  # allocates to the nominal directions
-                policy, nominal = copy(policy), bound(policy, plant.robot)
-                vars(policy)["bind"] = lambda _: nominal
+                nominal = bound(policy, plant.robot)
+                policy = _Bound(lambda _: nominal)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
         own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
         return Plant(state, plant.disturbance, own), policy, q[0], v[0]
+
+
+class _Bound(NamedTuple):
+    """Function that creates a policy for a robot, and the linear model of its design, if any."""
+
+    bind: Callable[[Robot], Policy]
+    lin: LinearModel | None = None
 
 
 def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
@@ -382,8 +390,8 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
         found: Array = bias + deviation * generator.standard_normal(len(bias))
         return found if given is None else found + np.asarray(given(t))
 
-    noisy = copy(policy)
     if not isinstance(policy, StateFeedback):
+        noisy = copy(policy)
         vars(noisy)["noise"] = error
         return noisy
     K = policy.K
@@ -392,8 +400,7 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
         inner = policy.bind(robot)
         return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ error(t)
 
-    vars(noisy)["bind"] = bind
-    return noisy
+    return _Bound(bind, policy.lin)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

@@ -242,3 +242,11 @@ def test_a_failed_chunk_leaves_the_others_in_the_file(tmp_path):
         with pytest.raises(fflin.SweepError, match=r"b\.h5\.part"):
             fflin.sweep(robot, configurations, chunk=10, out=tmp_path / "b.h5")
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5.part"]
+
+
+def test_without_h5py_the_error_names_the_package(tmp_path, monkeypatch):
+    path = tmp_path / "b.h5"
+    path.write_bytes(b"0" * 100)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(fflin.MissingPackageError, match="h5py"):
+        fflin.LinearBatch.load(path)
