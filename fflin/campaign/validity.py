@@ -190,8 +190,8 @@ def validity(
     confidence : float
         Confidence level of the intervals.
     limits : optional
-        Limits at which the inputs saturate, as in `simulate`. By default, the only saturation is
-        that thrusters cannot pull.
+        Limits at which the inputs saturate, as in `simulate`. By default, the inputs do not
+        saturate, and thrusts may be negative.
     executor, workers, threads, engine, progress : optional
         As in `monte_carlo`; ``progress(done, total)`` counts the runs of both sets.
 
