@@ -168,11 +168,6 @@ class OrbitField:
         return R, origins[..., None] + R @ self._lever
 
 
-def field_of(robot: Robot, frame: str) -> OrbitField | None:
-    """Return the field of a robot's orbit in a frame, or None without an orbit."""
-    return None if robot.orbit is None else OrbitField(robot, frame)
-
-
 # Weights of the rotations about the radial direction, the direction of flight and the normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 

@@ -15,7 +15,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, ArrayLike, Indices, instance, placement, vector
 from fflin.dynamics import coordinates as names
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 
@@ -98,7 +98,7 @@ class StateMap:
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         # Acceleration field of the robot's orbit; None without an orbit.
-        self.field = field_of(robot, self.frame)
+        self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         ends = 3, 6, 6 + n, 9 + n, 12 + n, self.nx
         self.groups = names.Groups(*map(slice, (0, *ends), ends))
@@ -428,10 +428,11 @@ class Actuation:
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
+        self._of_carried: list[int] = []
         for joint, items in carried.items():
             places, wrenches = zip(*items, strict=True)
             self.wrench_columns.append((joint, np.array(places), np.column_stack(wrenches)))
-        self._of_carried = [at for items in carried.values() for at, _ in items]
+            self._of_carried += places
         self.carried = bool(carried)  # whether columns depend on the configuration
 
     def columns(self, data: pin.Data, q: Array) -> Array:

@@ -13,7 +13,7 @@ from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError
 from fflin.base.tables import grid
 from fflin.base.validation import Array, Complex, FrozenArrays, Indices, Mask, instance
 from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
-from fflin.dynamics.orbital import field_of, mean_motion
+from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.joints import ROOT
@@ -423,8 +423,7 @@ def relative_equilibria(
     (24, True)
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    field = field_of(robot, frame_of(robot, frame))
-    if field is None:
+    if robot.orbit is None:
         raise InputError(
             f"'{robot.name}' is not in orbit; give it an orbit by "
             "robot.replace(orbit=fflin.CircularOrbit(altitude=...)) or --orbit"
@@ -445,7 +444,7 @@ def relative_equilibria(
             f"'{robot.name}' has no inertia about one axis; give the link an inertia about every "
             "axis"
         )
-    n, found = mean_motion(robot), []
+    n, found, field = mean_motion(robot), [], OrbitField(robot, frame_of(robot, frame))
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs
         if np.linalg.det(own) < 0.0:

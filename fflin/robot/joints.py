@@ -187,7 +187,8 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        self.follow(q)
+        if self.followers:
+            self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:

@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.equipment.assembly import carry_over, equipped
+from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import LinkMass, dynamic_parameters
@@ -97,20 +97,13 @@ def requested(lock: object) -> dict[str, float | None]:
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
     """Return a model with joints welded at q (nq,)."""
-    model = model.copy()
+    model, names = with_marked_frames(model)
     # Models built in code may lack a joint's frame, without which Pinocchio crashes.
     for index in indices:
         if not model.existFrame(model.names[index], pin.FrameType.JOINT):
             model.addJointFrame(index)
-    # Pinocchio finds frames by name, and a link and a joint may share a name. So all frames except
-    # those of joints have numbers for names until the joints are welded.
-    names = {}
-    for index, frame in enumerate(model.frames):
-        if index and frame.type != pin.FrameType.JOINT:
-            names[f"\0{index}"], frame.name = frame.name, f"\0{index}"
     reduced = pin.buildReducedModel(model, indices, q)
-    for frame in reduced.frames:
-        frame.name = names.get(frame.name, frame.name)
+    restore_names(reduced, names)
     return reduced
 
 
@@ -170,7 +163,10 @@ def _appended(
         added.names[index] = f"{prefix}.{name}"
     for index, each in enumerate(added.frames):
         each.name = f"{prefix}.{each.name}" if index else each.name
-    new = pin.appendModel(model, added, frame_index(model, frame), placement)
+    own, names = with_marked_frames(model)
+    theirs, their_names = with_marked_frames(added, prefix)
+    new = pin.appendModel(own, theirs, frame_index(model, frame), placement)
+    restore_names(new, names | their_names)
     new.name, new.gravity = model.name, model.gravity
     for part in (model, added):
         carry_over(part, new)

@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Standing
 from fflin.dynamics.integrators import held_derivatives, held_exponential
-from fflin.dynamics.orbital import GravityGradient, field_of
+from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.check import aba_route
@@ -80,8 +80,7 @@ class ModelDerivatives:
         # The accelerations do not depend on position and velocity of the base; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
         self._q[:3] = self._v[:3] = 0.0
-        field = field_of(robot, state.frame)
-        self._gradient = GravityGradient.at(field, lin.q) if field else None
+        self._gradient = GravityGradient.at(state.field, lin.q) if state.field else None
         if self._gradient:
             self._v[PIN_ANGULAR] += self._gradient.spin
         self._joints = range(ROOT, robot.model.njoints)

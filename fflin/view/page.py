@@ -26,7 +26,7 @@ import umsgpack
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, find_frame
@@ -357,8 +357,8 @@ class Page:
         size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
         self.size, self.floor = size, [*centre[:2].tolist(), float(low[2])]
         orbit: dict[str, object] = {}
-        field = field_of(robot, frame_of(robot, self.frame)) if self.scene == "space" else None
-        if field and robot.orbit:
+        if self.scene == "space" and robot.orbit:
+            field = OrbitField(robot, frame_of(robot, self.frame))
             # The z axis points away from the central body, and the x axis along the orbit.
             radial, along, normal = field.axes.T
             far = robot.orbit.radius / robot.orbit.body_radius

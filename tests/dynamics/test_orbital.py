@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField
 from fflin.dynamics.state import StateMap
 from tests.support.robots import free_body, random_point, random_pose
 
@@ -33,7 +33,7 @@ def test_a_body_is_pulled_as_its_mass_points(frame):
     )
     robot = in_orbit(fflin.from_model(model))
     q = fflin.configuration(robot, base=random_pose(rng, 70.0))
-    field, data = field_of(robot, frame), robot.create_data()
+    field, data = OrbitField(robot, frame), robot.create_data()
     pin.forwardKinematics(robot.model, data, q)
     place, r = data.oMi[1], {"lvlh": [0, 0, -1.0], "hill": [1.0, 0, 0]}[frame]
     G = N**2 * (3.0 * np.outer(r, r) - np.eye(3))

@@ -73,6 +73,21 @@ def test_each_joint_of_a_robot_with_shared_names_can_be_locked(tmp_path, links, 
 
 
 @pytest.mark.parametrize(("links", "joints"), NAMES)
+def test_wheels_modes_and_payloads_are_mounted_on_links_with_shared_names(tmp_path, links, joints):
+    bare = fflin.load(write(tmp_path / "shared.urdf", links, joints))
+    payload = fflin.load("planar_detumble")
+    for link in links:
+        wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), frame=link, inertia=0.01)
+        array = fflin.FlexibleAppendage(link, 0.5, [[0.3], [0.0], [0.0]], [[0.0], [0.1], [0.0]])
+        robot = bare.replace(inputs=[wheel, fflin.BaseTorque()], appendages=[array])
+        whole = fflin.capture(robot, link, payload).robot
+        for made in (robot, whole):
+            assert {frame.name for frame in made.model.frames.tolist()} >= set(links)
+            assert fflin.check(made, fflin.linearize(made)).ok
+        assert whole.n == robot.n + payload.n
+
+
+@pytest.mark.parametrize(("links", "joints"), NAMES)
 def test_a_robot_with_shared_names_is_shown(tmp_path, links, joints):
     robot = fflin.load(write(tmp_path / "shared.urdf", links, joints))
     robot = robot.replace(

@@ -180,7 +180,7 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
 
     The new joints come after all other joints that their carrier carries.
     """
-    new = model.copy()
+    new, names = with_marked_frames(model)
     for part in parts:
         on = part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
         # Models built in code may lack frames of their joints.
@@ -190,6 +190,7 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
         alone.addJoint(0, part.motion, pin.SE3.Identity(), part.name)
         alone.addJointFrame(1)
         new = pin.appendModel(new, alone, new.getFrameId(on, pin.FrameType.JOINT), part.placement)
+    restore_names(new, names)
     carry_over(model, new)
     for name, body in zip(model.names, bodies, strict=True):
         new.inertias[new.getJointId(name)] = body
@@ -199,6 +200,25 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
         new.inertias[index], armature[new.idx_vs[index]] = part.inertia, part.armature
     new.armature = armature
     return new
+
+
+def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dict[str, str]]:
+    """Return a copy whose frames, except those of joints, have marks for names; and {mark: name}.
+
+    Pinocchio finds frames by name when it joins or reduces models, but a link and a joint may share
+    a name.
+    """
+    marked, names = model.copy(), dict[str, str]()
+    for index, frame in enumerate(marked.frames):
+        if index and frame.type != pin.FrameType.JOINT:
+            names[f"\0{mark}.{index}"], frame.name = frame.name, f"\0{mark}.{index}"
+    return marked, names
+
+
+def restore_names(model: pin.Model, names: Mapping[str, str]) -> None:
+    """Give the frames with marks their names again."""
+    for frame in model.frames:
+        frame.name = names.get(frame.name, frame.name)
 
 
 def carry_over(model: pin.Model, new: pin.Model) -> None:
