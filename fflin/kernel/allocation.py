@@ -141,17 +141,15 @@ def least_squares(least, most, size):
     )
 
 
+@called
 def allocate(allocation, point, commanded):
-    """Write a command into the inputs, after allocation if there is an allocation problem."""
+    """Write the inputs whose accelerations are nearest to the accelerations of a command.
+
+    Without an allocation problem, the inputs are the command.
+    """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
-    else:
-        _realise(allocation, point, commanded)
-
-
-@called
-def _realise(allocation, point, commanded):
-    """Write the inputs whose accelerations are nearest to the accelerations of a command."""
+        return
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
     own, tree, problem = allocation.point, asking.tree, allocation.problem
     size, count, columns = len(tree.row), len(problem.least), problem.columns

@@ -22,6 +22,8 @@ S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of r
 using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 """
 
+from collections import namedtuple
+
 import numpy as np
 
 from fflin.base.validation import Array, Mask
@@ -167,7 +169,6 @@ def _unpack(work, start, entries, out, first, offset):
 def derive(tree, points, out, lanes, work):
     """Write the results of `RowAccelerations` at eight or more points, which may be at rest."""
     q, nu, force, u = points
-    q_lanes, nu_lanes, force_lanes, u_lanes = lanes
     c, A, by_u, judged = out
     size = len(tree.row)
     slopes, moves = tree.size, len(nu) > 0
@@ -177,15 +178,15 @@ def derive(tree, points, out, lanes, work):
         # If the last block has fewer than eight points, it overlaps the block before and fills all
         # lanes.
         first = min(block, len(q) - LANES)
-        _pack(q, first, q_lanes)
-        bodies.outwards(work, tree, q_lanes)
+        _pack(q, first, lanes.q)
+        bodies.outwards(work, tree, lanes.q)
         if moves:
-            _pack(nu, first, nu_lanes)
-            _pack(force, first, force_lanes)
-            _pack(u, first, u_lanes)
-            bodies.move_bodies(work, tree, nu_lanes)
+            _pack(nu, first, lanes.nu)
+            _pack(force, first, lanes.force)
+            _pack(u, first, lanes.u)
+            bodies.move_bodies(work, tree, lanes.nu)
             bodies.load_bodies(work, tree)
-            bodies.load_carried(work, tree, u_lanes)
+            bodies.load_carried(work, tree, lanes.u)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
         for k in range(size):  # `factorise` overwrites the diagonal of the packed M
@@ -196,7 +197,7 @@ def derive(tree, points, out, lanes, work):
             bodies.collect(work, tree)
             bodies.collect_momenta(work, tree)
             for index in range(size):
-                value = load(force_lanes, index) - load(work, tree.bias + index)
+                value = load(lanes.force, index) - load(work, tree.bias + index)
                 store(work, tree.c + index, value)
             bodies.solve(work, tree, tree.c)
         bodies.invert_factor(work, tree)
@@ -214,6 +215,10 @@ def derive(tree, points, out, lanes, work):
 
 
 _FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is accurate
+
+
+class Packed(namedtuple("Packed", "q nu force u")):
+    """Arrays of eight points; their second axis is the lane."""
 
 
 class RowAccelerations:
@@ -256,7 +261,7 @@ class RowAccelerations:
             # numba would compile a second function for read-only arrays.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
             (c, A, by_u.reshape(len(by_u), -1), judged),
-            tuple(map(work_space, self._sizes)),  # their second axis is the lane
+            Packed(*map(work_space, self._sizes)),
             work_space(self._work),
         )
         # A zero pivot gives NaN, and comparisons with NaN are false.
