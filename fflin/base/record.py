@@ -256,6 +256,11 @@ class Design(Result):
 
     verified: bool = field(default=True, kw_only=True)
 
+    def __init_subclass__(cls) -> None:
+        # The types of fields in a file are read from annotations as text.
+        if not all(isinstance(kind, str) for kind in vars(cls).get("__annotations__", {}).values()):
+            raise TypeError(f"'{cls.__name__}' needs `from __future__ import annotations`")
+
     def save(self, path: str | Path) -> None:
         """Write the result to a .npz, .mat or .json file; the file is written atomically.
 
