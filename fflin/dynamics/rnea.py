@@ -53,8 +53,10 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        slides = [joint for joint in robot.joints if joint.prismatic and joint.kind != "modal"]
-        self._slides = [joint.idx_q for joint in slides]
+        self._slides: list[int] = []
+        for joint in robot.joints:
+            if joint.prismatic and joint.kind != "modal":
+                self._slides.append(joint.idx_q)
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -205,7 +207,9 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
+        self._stored: list[tuple[int, Array]] = []
+        for mounted, momentum in robot.stored_momentum:
+            self._stored.append((mounted, skew(momentum)))
         self._field = state.field
         self._still = np.zeros(robot.nv)
 

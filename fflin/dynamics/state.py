@@ -379,7 +379,9 @@ class Actuation:
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self.state, self._model = state, robot.model
-        signals: list[tuple[str, str, str]] = []  # name, unit and group of each input
+        names: list[str] = []
+        units: list[str] = []
+        groups: list[str] = []
         columns: list[Array] = []
         held: list[slice] = []
         # Thrusters and wheels without a joint of their own. {joint on which they are mounted:
@@ -406,8 +408,9 @@ class Actuation:
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            signals += [(name, unit, item.GROUP) for name in own]
-        names, units, groups = ([signal[k] for signal in signals] for k in range(3))
+            names += own
+            units += [unit] * len(own)
+            groups += [item.GROUP] * len(own)
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")
@@ -416,9 +419,9 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups: dict[str, Indices] = {
-            group: np.flatnonzero(np.array(groups) == group) for group in dict.fromkeys(groups)
-        }
+        self.groups: dict[str, Indices] = {}
+        for group in dict.fromkeys(groups):
+            self.groups[group] = np.flatnonzero(np.array(groups) == group)
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
