@@ -321,8 +321,8 @@ def tvlqr(
     >>> fflin.tvlqr(along, sample=0.1).K.shape
     (21, 9, 18)
     """
-    names, dt = traj.state_names, sample_time(traj, sample)
-    steady = asks_steady(Qf)
+    dt, steady = sample_time(traj, sample), asks_steady(Qf)
+    names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
         Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
