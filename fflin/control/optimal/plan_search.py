@@ -28,8 +28,8 @@ _NEARLY = 1e-3
 # closed.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# The search ends after _MOST iterations, or if the predicted reduction of the merit function is less
-# than the fraction _SAVED.
+# The search ends after _MOST iterations, or if the predicted reduction of the merit function is
+# less than the fraction _SAVED.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
 # Cost of a change of wheel angles and rates in an iteration, relative to the cost for other states.

@@ -194,8 +194,8 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # Rows of Bc that should be zero contain rounding errors, so they are set to zero. Newton's method
-    # corrects the effect, because it uses the original equation.
+    # Rows of Bc that should be zero contain rounding errors, so they are set to zero. Newton's
+    # method corrects the effect, because it uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
