@@ -1,4 +1,4 @@
-"""Mass properties of a robot at an operating point, and authority of its wheels and thrusters."""
+"""Mass properties and actuator authority of a robot at an operating point."""
 
 import math
 from itertools import combinations, islice
@@ -168,7 +168,10 @@ def gives_every_wrench(W: Array, pushing: Mask) -> bool:
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Return whether a robot has thrusters that, with its other inputs, produce every wrench."""
+    """Return whether the inputs of a robot, including thrusters, can produce every wrench.
+
+    Return False if the robot has no thrusters.
+    """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
     if thrusters is None:
@@ -192,7 +195,7 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     Parameters
     ----------
     W : ndarray (m, k)
-        Wrenches of unit inputs; the rank of W is m.
+        Wrench (or momentum) of each unit input; the rank of W is m.
     low, high : ndarray (k,)
         Limits of the inputs, with ``low <= 0 <= high``.
     kept : ndarray (m, d)

@@ -142,7 +142,7 @@ def _of_inertia(
     to_modes = back @ inverse
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
-    # Gain at w = 1, before any limit reduces the bandwidth.
+    # Gain of a loop with a bandwidth of 1 rad/s.
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
@@ -309,7 +309,8 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
     """Return the factor on the bandwidth at which each limited signal reaches its limit.
 
-    The signals `used` grow with the bandwidth to the given power.
+    The signals have the values `used` at a factor of 1, and grow with the factor to the power
+    `power`.
     """
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
@@ -398,7 +399,7 @@ def _slowed(
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the coordinates with the largest motion, weighted by inertia, in modes (nx, k)."""
+    """Return the names of the coordinates with the largest inertia-weighted motion in `modes`."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)

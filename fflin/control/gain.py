@@ -41,7 +41,7 @@ _FRAGILE = 0.3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelDesign(Design):
-    """Design for a linear model x' = A x + B u; the model is sampled if dt [s] is not 0."""
+    """Design for a linear model ``dx/dt = A x + B u``, or for a sampled model if dt is not 0."""
 
     A: Array
     B: Array

@@ -1,4 +1,4 @@
-"""Kalman filters about a point and along a trajectory, and the LQG compensator."""
+"""Kalman filters, which estimate states about a point or along a trajectory, and LQG."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Output feedback by a linear system: a controller from another tool, a file or a compensator."""
+"""Output feedback by a linear system, which comes from another tool, a file or `lqg`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ _ROUNDING = 1e-6
 
 
 class System(NamedTuple):
-    """State space A, B, C, D; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
+    """State space A, B, C, D with names of its signals.
+
+    The sample time dt [s] is 0 in continuous time, -1 if it is unknown, and None if not given.
+    """
 
     A: Array
     B: Array

@@ -1,4 +1,4 @@
-"""Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
+"""Linear quadratic regulators from a Riccati equation, and `acceleration_lqr` in closed form."""
 
 import warnings
 from collections.abc import Mapping, Sequence

@@ -27,7 +27,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
-# Weights Q, R and Qf, and the name of the rule for Q and R.
+# Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
@@ -45,8 +45,8 @@ _OVER = 1e-3
 # The two kinds of soft-limit violations that the notes of a run report.
 _OF_PLANS, _OF_ROBOT = "plans that exceed", "samples at which the robot exceeds"
 
-# _OPEN is DAQP's infinity, _SOFT is its code of a soft limit, and _SOFTENED is its exit flag for a
-# plan that exceeds a soft limit. _MOST is the largest number of iterations.
+# Constants of DAQP. _OPEN is its infinity. _SOFT is its code for a soft limit. _SOFTENED is its
+# exit flag for a plan that exceeds a soft limit. _MOST is the largest number of iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
@@ -169,7 +169,7 @@ class _Predictive:
         return Receding(self.horizon, self.deviation(robot))
 
     def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
-        """Return the quadratic program at the error e (nx,), by default zero, and time t [s].
+        """Return the quadratic program for the error e (nx,) at time t [s]; e is zero by default.
 
         About a point, e is the deviation x - x0, and the program does not depend on t.
         """
@@ -432,7 +432,7 @@ class Receding:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the run: plans, exceeded limits and failures of the solver."""
+        """Notes on the run: number of plans, violations of soft limits, and solver failures."""
         said = (
             f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
             f"{self.solves}"
@@ -455,7 +455,7 @@ class Receding:
         return command
 
     def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) relative to u* for the error e (nx,)."""
+        """Return the command minus the reference inputs (nu,), for the error e (nx,)."""
         stages, acting = self.of.window(t), self.of.acting
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:

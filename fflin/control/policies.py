@@ -279,7 +279,7 @@ class Sample(NamedTuple):
 
 
 class Loop:
-    """Policy that measures a robot's outputs relative to a reference, for a compensator.
+    """Policy that measures a robot's outputs and computes the command with a compensator.
 
     The compensator's state z advances at each sample, or at each stage if dt is 0.
     """

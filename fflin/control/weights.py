@@ -135,7 +135,8 @@ def require_semidefinite(
 ) -> None:
     """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite.
 
-    A negative eigenvalue that is smaller than `rounding` times the largest entry is permitted.
+    A negative eigenvalue is permitted if its magnitude is at most `rounding` times the largest
+    entry. If `definite` is True, the matrix must be positive definite.
     """
     try:
         np.linalg.cholesky(matrix)  # quicker than eigenvalues
@@ -263,9 +264,9 @@ def rule_weights(
 
     `given` weights replace weights of the rule.
     """
-    # If the continuous model of a sampled model is known, the rule gives a continuous cost, which is
-    # converted to a sampled cost with held inputs. By default, the robot's `weights` name the rule;
-    # if they do not, it is "urdf".
+    # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
+    # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
+    # the rule; if they do not, it is "urdf".
     source = lin.generator or lin
     layers = [(given, False)] if given else []
     if name is None and lin.weights:

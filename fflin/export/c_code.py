@@ -1,4 +1,4 @@
-"""C code of a control law: its source, header and test program, and a policy that calls it."""
+"""C code of a control law (source, header, test program), and a policy that calls the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Differential Riccati equation, solved backwards in time with P positive semidefinite."""
+"""Solver of differential Riccati equations, backwards in time; P stays positive semidefinite."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BATCH = 64
 
 
 class Coefficients(NamedTuple):
-    """Coefficients A, S = B R^-1 B' and Q (.., nx, nx) of -dP/dt = A' P + P A - P S P + Q."""
+    """Coefficients (.., nx, nx) of ``-dP/dt = A' P + P A - P S P + Q``, with ``S = B R^-1 B'``."""
 
     A: Array
     S: Array
@@ -114,7 +114,7 @@ _Interval = tuple[float, float, Transition, Transition, Transition, Coefficients
 
 
 def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Interval]:
-    """Return the intervals between knots (k + 1,)."""
+    """Return the k intervals between knots (k + 1,), with their transitions."""
     a, b, count = knots[:-1], knots[1:], len(knots) - 1
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
@@ -129,7 +129,7 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
 
 
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Return times, and P at these times, integrated backwards from the last knot.
+    """Integrate P backwards from the last knot, and return the times and the values of P.
 
     `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, raise
     `LinAlgError`.
@@ -164,8 +164,8 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
     """Return K and P from the last sample to the first, and the largest relative residual."""
-    # A stage has the cost matrix (nx + nu, nx + nu) of the error and the input at the start of a
-    # sample, and the matrix (nx, nx + nu) that maps both to the next error.
+    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost of the error and the
+    # input at the start of a sample. The second (nx, nx + nu) maps them to the next error.
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole

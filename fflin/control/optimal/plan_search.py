@@ -36,9 +36,10 @@ _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 # It is small, because wheels may have any angle and rate.
 _OF_WHEELS = 1e-6
 
-# The search also ends if the quadratic programs violate the goal or limits at the knots by more
-# than _HOPELESS [rad or m], and this violation does not fall by a tenth in _STAGNANT iterations.
-# Smaller violations come from the finite penalty, and vanish when the gaps are closed.
+# The search also ends if the solutions of the quadratic programs violate the goal or the limits at
+# the knots by more than _HOPELESS [rad or m], and if this violation does not fall by a tenth in
+# _STAGNANT iterations. Smaller violations are due to the finite penalty. They vanish when the gaps
+# are closed.
 _STAGNANT, _HOPELESS = 10, 1e-2
 
 # Penalty for a violation of the goal or a limit by 1 rad or 1 m. The unit of the penalty is the
@@ -144,7 +145,7 @@ class Search(NamedTuple):
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
-        """Return a mask of points (N, parts - 1, nx) that, or whose neighbours, exceed a limit."""
+        """Return a mask (N, parts - 1, nx) of points that exceed a limit, and their neighbours."""
         beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self.size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]

@@ -26,7 +26,7 @@ _NEAR = 1e-3
 _APART = 1e-5
 
 # A pole is near the stability boundary if its distance from the boundary, relative to the largest
-# pole, is below this. Rounding moves the pole of a mode that Q does not weight by such a distance.
+# pole, is below this. Rounding errors move a pole by such a distance if Q does not weight its mode.
 _NEAR_BOUNDARY = 1e-6
 
 
@@ -65,7 +65,10 @@ class _Trial(NamedTuple):
 
 
 class Riccati:
-    """Equation A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0, or its sampled form if dt > 0."""
+    """Algebraic Riccati equation, in its sampled form if dt > 0.
+
+    In continuous time, it is ``A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0``.
+    """
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
@@ -120,10 +123,10 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Return the stabilising solution, by the half-size method or SciPy, or raise `LinAlgError`.
+    """Return the stabilising solution of the half-size method, or of SciPy if this is inaccurate.
 
-    Newton's method refines the solution (D. L. Kleinman, IEEE Trans. Automatic Control 13(1),
-    1968).
+    Raise `LinAlgError` if both fail. Newton's method refines the solution (D. L. Kleinman, IEEE
+    Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)

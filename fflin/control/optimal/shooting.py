@@ -1,4 +1,4 @@
-"""Multiple shooting: the initial guess, the gaps between intervals, and their Jacobians."""
+"""Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ Point = tuple[Array, Array]
 
 
 class Motions(NamedTuple):
-    """Motions of N intervals from the knots, with a row at the end of each step."""
+    """Motions of N intervals from the knots, with a row for the start and for each step."""
 
     q: Array  # (N, steps + 1, nq)
     v: Array  # (N, steps + 1, nv)
@@ -40,8 +40,8 @@ class Shooting:
     t (N + 1,) contains the times of the knots and of the end.
     """
 
-    # A step from one point to another is z = (theta_b, r_b, q_m, nu) (nx,) in base axes. It has
-    # the states of the linear models, but the rotation vector theta_b replaces 2 q_b.
+    # A step z (nx,) from one point to another has the order of the states of the linear models, in
+    # base axes. The rotation vector of the base replaces 2 q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
@@ -95,7 +95,7 @@ class Shooting:
         return np.array([self.between(row[:2], row[2:]) for row in rows])
 
     def flown(self, start: Point, u: Array) -> Point:
-        """Return the knots of the motion from a point under inputs."""
+        """Integrate the motion from a point under the inputs u, and return its knots."""
         q, v = (np.tile(each, (len(u), 1)) for each in start)
         for k in range(len(u) - 1):
             found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
@@ -103,7 +103,10 @@ class Shooting:
         return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
-        """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
+        """Return the values (.., nx) of states with limits: joint positions and rates.
+
+        The values of the base are zero.
+        """
         state = self.state
         n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
         values[..., 6 : 6 + n] = state.joint_positions(q)
@@ -112,7 +115,7 @@ class Shooting:
 
     def inside(self, motions: Motions, parts: int) -> Array:
         """Return limited values (N, parts - 1, nx) where each interval is divided into parts."""
-        # Between the ends of steps, rates are Hermite cubics and positions are their integrals.
+        # Within a step, the rates are Hermite cubics of time. The positions are their integrals.
         n, steps = self.state.robot.n, motions.q.shape[1] - 1
         at = np.arange(1, parts) * steps / parts
         step = at.astype(int)
