@@ -255,8 +255,8 @@ def _fastest(
 
     T (k, m) maps the rates of the modes to the speeds.
     """
-    # The equation of a mode is mass x'' + most x' + rates^2 x = 0. Its damper reduces `mass` (m,)
-    # from 1 to 1 minus the damping.
+    # The equation of a mode is mass x'' + most x' + rates^2 x = 0. Without damping, `mass` (m,) is
+    # 1; dampers reduce it.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     if not any(name.startswith("qdot_m.") for name in lin.limits):
@@ -296,7 +296,7 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     """Return the largest entries of ``K d`` over all displacements d of magnitude `size`.
 
-    The displacements of the base have any direction, and those of the joints any sign.
+    Displacements of the base have any direction. Displacements of joints have any sign.
     """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size

@@ -202,9 +202,9 @@ class Gain(ModelDesign):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        # The disk margin is the inverse of a norm: half the difference between the sensitivity and
-        # the complementary sensitivity at the inputs, which are scaled by sqrt(R_ii). See Seiler,
-        # Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm is computed from
+        # The disk margin is the inverse H-infinity norm of half the difference between sensitivity
+        # and complementary sensitivity at the inputs. The inputs are scaled by sqrt(R_ii). See
+        # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm is computed from
         # eigenvalues of Hamiltonian matrices, without a grid of frequencies. See Bruinsma and
         # Steinbuch, Systems and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)

@@ -185,7 +185,7 @@ def plan(
 
 
 class _Made(NamedTuple):
-    """Plan, with the end error and the limit violations of its integrated motion."""
+    """Plan, with the final error and the limit violations of the integrated motion."""
 
     q: Array
     v: Array

@@ -31,7 +31,7 @@ _NOTHING = 1e-6
 
 
 class LoopMargins(NamedTuple):
-    """Phase margin [deg] of a loop, and the range of gain factors for which the loop is stable."""
+    """Phase margin [deg] of a loop, and the gain factors between which the loop is stable."""
 
     phase: float
     gain: tuple[float, float]

@@ -195,7 +195,7 @@ class AllocatedPolicy:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on a run: the commanded inputs, the inputs that realise them, and inner notes."""
+        """Notes on a run: how the commands are realised, and the notes of the inner policy."""
         asked, given = (
             list(dict.fromkeys(group_of(key) for key in input_keys(each)))
             for each in (self._design, self._robot)
@@ -237,9 +237,10 @@ class Clock:
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the index of each output among the states and gyroscope rates, and the gyroscopes.
+    """Return an index for each output, and the list of gyroscopes.
 
-    The three rates of each gyroscope follow the states. Other sensors raise `InputError`.
+    The index of an output is the index of a state. The rates of the gyroscopes are numbered after
+    the states. Other sensors raise `InputError`.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:

@@ -161,7 +161,7 @@ def half_size(
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve by the half-size method, with the velocity weights in Q scaled by 1 + `apart`."""
+    """Solve by the half-size method, with rows and columns of Q for rates scaled by 1 + `apart`."""
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -317,7 +317,7 @@ def second_order_loop(
     """Return a loop that is optimal if odd powers are neglected (10.5).
 
     The results are the modes V of the loop, and the cost V^H (Q + K' R K) V of its gain K. Return
-    None if the model does not have the required second-order form.
+    None if there is no such loop, for example because the model is not of second order.
     """
     nx = len(A)
     m = nx // 2
