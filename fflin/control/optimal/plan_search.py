@@ -9,7 +9,7 @@ from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, Indices, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 
-# Largest sum of the violations [rad, m, s] of the goal and the limits in a plan.
+# A plan is accepted if the sum of its violations [rad, m, s] of goal and limits is at most this.
 _ENDS = 1e-8
 
 # A point within an interval gets a limit once an iterate exceeds the limit at this point, or at a
@@ -20,8 +20,8 @@ _LIMITED, _TIGHTER = 0.002, 0.005
 # If no gap exceeds this, the gaps count as closed, and the plan is integrated as one motion.
 _MEETS = 1e-10
 
-# If the plan is integrated as one motion, its violations are corrected only if their sum is at most
-# half of this.
+# After a plan is integrated as one motion, its violations are corrected only if their sum is at
+# most half of this.
 _NEARLY = 1e-3
 
 # Integration accuracy of interval ends: _SEEKS during the search, and _FLIES while the gaps are
@@ -226,7 +226,7 @@ def _stagnates(left: list[float]) -> bool:
 def excess(room: Array) -> Array:
     """Return by how much points exceed limits.
 
-    `room` (2, ..) contains the distances of the points from their lower and upper limits.
+    `room` (2, ..) contains the lower and upper limits minus the values at the points.
     """
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)
 
