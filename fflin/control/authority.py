@@ -1,4 +1,4 @@
-"""Mass properties of a robot at an operating point, and authority of its wheels and thrusters."""
+"""Mass properties and actuator authority of a robot at an operating point."""
 
 import math
 from itertools import combinations, islice
@@ -18,7 +18,7 @@ from fflin.robot.robot import Robot
 _FACETS = 20_000  # normals computed together
 _MANY = 36  # thrusters; their zonotope has 400 000 facets
 
-# A force or torque below this fraction of the sum of all thrusts is rounding error.
+# A relative value below this is rounding error.
 _ROUNDING = 1e-9
 
 _AXES = "xyz"
@@ -27,7 +27,7 @@ _ORIGIN = np.eye(7)[6]  # position and quaternion of the base
 
 
 class WheelMomentum(NamedTuple):
-    """Momentum of a robot's wheels in base axes, and momentum that they can store."""
+    """Total momentum of a robot's wheels in base axes, and the momentum that they can store."""
 
     wheels: int
     total: Array  # (3,) [N m s]
@@ -53,8 +53,8 @@ class WheelMomentum(NamedTuple):
 class ThrusterAuthority(NamedTuple):
     """Force and torque that the thrusters alone can produce in every direction.
 
-    Both are None unless the thrusters can push in every direction, all thrusters have limits, and
-    there are at most _MANY thrusters.
+    `least_force` and `least_torque` are None if the thrusters cannot produce every wrench, if a
+    thruster has no limit, or if there are more than _MANY thrusters.
     """
 
     thrusters: int
@@ -81,7 +81,7 @@ class ThrusterAuthority(NamedTuple):
 
 
 class PointProperties(NamedTuple):
-    """Properties of a robot at an operating point, in base axes."""
+    """Mass properties and actuator authority at an operating point, in base axes."""
 
     center_of_mass: Array  # (3,) [m]
     inertia: Array  # (3, 3) [kg m^2], about the centre of mass
@@ -106,7 +106,7 @@ class PointProperties(NamedTuple):
 
 
 def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
-    """Return mass properties and properties of wheels and thrusters at q and v."""
+    """Return the mass properties, the wheel momentum and the thruster authority at q and v."""
     # With the base at the origin, world axes are base axes.
     data, q = robot.create_data(), np.concatenate((_ORIGIN, q[7:]))
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
@@ -116,7 +116,7 @@ def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
 
 
 def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
-    """Return the total momentum of the wheels relative to their carriers, and what they store."""
+    """Return the wheels' total momentum relative to their carriers, and their momentum capacity."""
     limits, wheels, axes = limits_of(robot), named_wheels(robot.inputs), np.zeros((0, 3))
     stored, largest = np.zeros((2, len(wheels)))
     for k, (name, wheel) in enumerate(wheels):
@@ -133,7 +133,10 @@ def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
 
 
 def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:
-    """Return the authority of the thrusters about a centre of mass (3,); base at the origin."""
+    """Return the authority of the thrusters about the centre of mass `center` (3,).
+
+    The base must be at the origin in q.
+    """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
     count = len(thrusters)
@@ -151,7 +154,10 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
 
 
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:
-    """Return whether inputs W (6, k) can produce every wrench; `pushing` inputs only push."""
+    """Return whether inputs can produce every wrench.
+
+    The columns of W (6, k) are the wrenches of unit inputs. `pushing` inputs cannot be negative.
+    """
     from scipy.optimize import nnls
 
     both = np.hstack((W, -W[:, ~pushing]))
@@ -162,7 +168,10 @@ def gives_every_wrench(W: Array, pushing: Mask) -> bool:
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Return whether thrusters and other base inputs of a robot can push in every direction."""
+    """Return whether the inputs of a robot, including thrusters, can produce every wrench.
+
+    Return False if the robot has no thrusters.
+    """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust")
     if thrusters is None:
@@ -172,22 +181,25 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
-    r"""Return the largest r for which inputs reach W u = r kept d for every unit vector d.
+    r"""Return the largest magnitude that the wrench of the inputs can have in every direction.
 
-    The values W u of inputs between `low` and `high` form a zonotope
+    This is the largest r for which, for every unit vector d, inputs u within their limits satisfy
+    ``W u = r kept d``.
+
+    The wrenches ``W u`` of inputs between `low` and `high` form a zonotope
     :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`.
-    The normals n of its facets are orthogonal to m - 1 independent columns of W. Within the
-    subspace that the columns of `kept` span, a facet is at the distance
-    :math:`h(n) / |kept^T n|` from the origin; r is the least of these distances.
+    The normal n of each facet is orthogonal to m - 1 independent columns of W. The distance of the
+    facet from the origin, in the subspace spanned by the columns of `kept`, is
+    :math:`h(n) / |kept^T n|`. The least of these distances is r.
 
     Parameters
     ----------
     W : ndarray (m, k)
-        Wrenches of unit inputs; the rank of W is m.
+        Wrench (or momentum) of each unit input; the rank of W is m.
     low, high : ndarray (k,)
-        Limits of the inputs, with low <= 0 <= high.
+        Limits of the inputs, with ``low <= 0 <= high``.
     kept : ndarray (m, d)
-        Orthonormal columns.
+        Orthonormal columns that span the directions of the wrench.
     """
     scale = np.linalg.norm(W, axis=1)
     columns = W / scale[:, None]

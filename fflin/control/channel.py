@@ -20,7 +20,7 @@ from fflin.robot.robot import Robot
 
 
 class Saturation(NamedTuple):
-    """Limits, wheels and pulses that act on the commands of a robot's inputs."""
+    """Input limits, wheel speed limits and thruster pulses that change the commands."""
 
     low: Array  # (nu,)
     high: Array
@@ -32,7 +32,7 @@ class Saturation(NamedTuple):
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int, *, pulsed: bool
 ) -> Saturation:
-    """Return the saturation of commands at q, for steps of dt [s] and `sample` steps per sample.
+    """Return the saturation at q, for integration steps of dt [s] and `sample` steps per sample.
 
     `sample` is 0 for continuous commands. `pulsed` is True if pulsed thrusters must realise the
     commands.
@@ -84,7 +84,10 @@ def saturation(
 def warn_beyond(
     robot: str, where: str, units: Mapping[str, str], asked: Array, low: Array, high: Array
 ) -> None:
-    """Warn about inputs {name: unit} whose commands (N, nu) exceed their limits."""
+    """Warn about inputs whose commands `asked` (N, nu) exceed their limits.
+
+    `units` maps the name of each input to its unit.
+    """
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
@@ -101,22 +104,22 @@ def warn_beyond(
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """Policy whose commands (nu,) are checked; the policy gets copies of q and v."""
+    """Call a policy with copies of q and v, and check its command (nu,)."""
 
     policy: Callable[[float, Array, Array], object]
     names: tuple[str, ...]
     limits: tuple[Array, Array]
-    # A motion whose squared velocity exceeds this counts as diverging. A command that is not finite
-    # then raises no error.
+    # If the squared velocity exceeds this, the motion counts as diverging, and a command that is
+    # not finite raises no error.
     slow: float
 
     @property
     def advance(self) -> Callable[..., None] | None:
-        """Method that integrates the policy's own state, or None if it has none."""
+        """Method that integrates the policy's own state, or None if the policy has no state."""
         return getattr(self.policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command (nu,), or raise `InputError` if it is not finite or of wrong shape."""
+        """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
         own = type(u) is np.ndarray and u.dtype is DOUBLE
         u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
@@ -138,9 +141,9 @@ class Law:
 
 
 def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
-    """Return the kernel's channel with limits; the sample time and the delay are in steps.
+    """Return the kernel's channel for limits, a sample time [steps] and a delay [steps].
 
-    `initial` (nu,) acts until the first command arrives.
+    The inputs `initial` (nu,) are applied until the first command arrives.
     """
     slots = delay // sample + 1 if sample else 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
@@ -163,7 +166,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 class Channel:
     """Channel from the commands of `law` to the applied inputs, computed by the kernel's functions.
 
-    `law` and `speeds` are called with the arguments of `begin`. `speeds` returns the
+    `law` and `speeds` are called with the arguments `point` of `begin`. `speeds` returns the
     speeds (k,) of the wheels whose speed is limited.
     """
 

@@ -15,46 +15,45 @@ from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
-# Bandwidth [rad/s] of a loop that no limit slows; the loop settles in about 30 s. If the inputs are
-# held for h seconds, the bandwidth is at most _HELD / h.
+# Bandwidth [rad/s] of a loop if no limit reduces it; the loop settles in about 30 s. If the inputs
+# are held for h seconds, the rate of the fastest mode is at most _HELD / h.
 BANDWIDTH, _HELD = 0.2, 0.3
 
-# Displacements from which the robot must return within its limits: a rotation of the base [deg],
+# The robot must return within its limits from these displacements: a rotation of the base [deg],
 # an offset of the base in radii of gyration, and a joint displacement [rad] or [m]. A joint
-# displacement is at most the fraction TRAVEL of the joint's range.
+# displacement is at most the fraction TRAVEL of the joint's position limit.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# The bandwidth is at least the fraction _OF_GROWTH of the growth rate of an unstable mode. If
-# efforts are limited, it is at least the fraction _LEAST_OF_GROWTH. With a lower bandwidth, light
-# joints would swing by radians.
+# The bandwidth is at least the fraction _OF_GROWTH of the growth rate of an unstable mode. Effort
+# limits may reduce it to the fraction _LEAST_OF_GROWTH. With a lower bandwidth, joints with a small
+# inertia would swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The effect of the inputs on a mode, relative to the effort that holds the mode at rest, is raised
-# to this if it is smaller. Such a mode keeps the decay that it has without feedback.
+# Least effect of the inputs on a mode, relative to the effort that holds the mode at rest. A
+# smaller effect is raised to this value. Such a mode keeps the decay that it has without feedback.
 _LEAST_REACH = 1e-3
 
-# If the effect of the inputs on a coordinate, relative to the inertia, is below this, it counts as
-# zero.
+# An effect of the inputs on a coordinate counts as zero if its ratio to the inertia is below this.
 _IDLE = 1e-12
 
-# The effect of a damper depends on the bandwidth, so the bandwidth of a robot with dampers is
-# computed in this number of iterations.
+# Largest number of iterations for the bandwidth of a robot with dampers. The bandwidth is iterated
+# because the effect of a damper depends on it.
 _PASSES = 4
 
-# Largest number of trials with a lower bandwidth for a loop with springs or gravity. The fastest
-# trial is chosen among trials whose effort factor `left` is at least _IN_VAIN times the largest
-# one.
+# Largest number of bandwidths that are tried for a loop with springs or gravity. If all of them
+# exceed an effort limit, the highest bandwidth is chosen among those whose factor `left` is at
+# least _IN_VAIN times the largest factor.
 _TRIALS, _IN_VAIN = 8, 0.9
 
-# The report names a mode whose decay is below this fraction of the nominal decay, which is
-# sqrt(1/2) times the bandwidth.
+# The report names a mode if its decay rate is below this fraction of the nominal decay rate, which
+# is sqrt(1/2) times the bandwidth.
 _AS_SLOW = 0.9
 
 _NOT_ENOUGH = "is too small for all displacements"
 
 
 class Weights(NamedTuple):
-    """Weights Q (nx, nx) and R (nu, nu) of a continuous cost, their rule and the bandwidth."""
+    """Weights Q (nx, nx) and R (nu, nu), with their rule and the bandwidth of the loop."""
 
     Q: Array
     R: Array
@@ -64,25 +63,26 @@ class Weights(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """Bandwidth of a loop if no limit reduces it, and fraction of the design displacements."""
+    """Bandwidth that a loop has if no limit reduces it, and scale of its displacements."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
-    fraction: float = 1.0
+    fraction: float = 1.0  # factor on the design displacements
     hold: float = 0.0  # [s], hold time of the inputs of a continuous model
     held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
 class Limit(NamedTuple):
-    """Largest bandwidth permitted by a limit, and the name of this limit."""
+    """Largest bandwidth that a limit permits, and the description of the limit."""
 
     bandwidth: float
     what: str
 
 
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
-    """Return weights with which a displaced robot stays within its limits on its return (10.7).
+    """Return weights with which a displaced robot returns without exceeding its limits (10.7).
 
-    `momenta` {rate of a wheel: largest momentum that the inputs may add to the wheel}.
+    `momenta` maps the name of a wheel's rate to the largest momentum that the inputs may add to
+    the wheel.
     """
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
@@ -101,14 +101,14 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return the damping matrix B (m, m) of viscous dampers, zero if there are none."""
+    """Return the viscous damping matrix B (m, m), which is zero for a sampled model."""
     m = len(lin.M)
     if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # Gyroscopic coupling only moves energy between coordinates, and an orbit only rotates them.
-    # Neither is damping.
+    # Gyroscopic coupling and orbital motion do not dissipate energy, so their terms are not
+    # damping.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -119,7 +119,10 @@ def _damping(lin: LinearModel) -> Array:
 def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
-    """Return the weights for an inertia M (m, m) that includes damping / w; `inverse` is N^-1."""
+    """Return the weights for an inertia M (m, m) that includes the damping divided by w.
+
+    `inverse` (m, m) maps the rates of the coordinates to the velocities of the model.
+    """
     h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.fraction)
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
@@ -139,12 +142,12 @@ def _of_inertia(
     to_modes = back @ inverse
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
-    # Gain at w = 1, before any limit reduces the bandwidth.
+    # Gain of a loop with a bandwidth of 1 rad/s.
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
-    # Limits of the coordinates' speeds, and of the momenta that the inputs add to wheels.
+    # Limits on the speeds of the coordinates, and limits on the momenta added to wheels.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
     room |= momenta
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
@@ -190,7 +193,7 @@ def _of_inertia(
 def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
-    """Return a function of the bandwidth that gives the weight (m, m) on velocities (10.8)."""
+    """Return a function that maps the bandwidth to the weight (m, m) on velocities (10.8)."""
     m, X = len(lin.M), rate_matrix(lin)
     size = np.sqrt(least)
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
@@ -216,7 +219,7 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     names, units = lin.state_names[:m], lin.state_units[:m]
     M, radius, size = lin.M, 1.0, np.empty(m)
     if names[:6] == state_keys(())[:6]:
-        # Radius of a spherical shell with the same mass and trace of the inertia.
+        # Radius of a spherical shell that has the mass of the robot and the trace of its inertia.
         mass = M[3, 3]
         center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
         moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
@@ -233,7 +236,10 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
 
 
 def _reach(S: Array, cost: Array, D: Array) -> Array:
-    """Return S R^-1 S' (m, m), with entries of D for coordinates on which no input acts."""
+    """Return the effect S R^-1 S' (m, m) of the inputs on the coordinates; it is positive definite.
+
+    For coordinates on which no input acts, the diagonal has the entries of D.
+    """
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
@@ -245,8 +251,12 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest speeds (k,) during the return at w = 1; T maps mode rates to speeds."""
-    # The mass (m,) of a mode is 1 without damping. The difference 1 - mass is the mode's damping.
+    """Return the largest speeds (k,) during the return, for a bandwidth of 1 rad/s.
+
+    T (k, m) maps the rates of the modes to the speeds.
+    """
+    # The equation of a mode is mass x'' + most x' + rates^2 x = 0. Without damping, `mass` (m,) is
+    # 1; dampers reduce it.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     if not any(name.startswith("qdot_m.") for name in lin.limits):
@@ -284,7 +294,10 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d over all directions of base displacements and joint signs."""
+    """Return the largest entries of ``K d`` over all displacements d of magnitude `size`.
+
+    Displacements of the base have any direction. Displacements of joints have any sign.
+    """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
     total: Array = np.abs(scaled[..., ~np.isin(groups, ("q_b", "r_b"))]).sum(axis=-1)
@@ -294,7 +307,11 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 
 
 def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
-    """Return the bandwidth factors at which signals reach their limits."""
+    """Return the factor on the bandwidth at which each limited signal reaches its limit.
+
+    The signals have the values `used` at a factor of 1, and grow with the factor to the power
+    `power`.
+    """
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
@@ -303,7 +320,7 @@ def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) 
 
 
 def _efforts_left(lin: LinearModel) -> dict[str, float]:
-    """Return the input limits minus the magnitudes of the inputs at the operating point."""
+    """Return the limit of each input minus the input's magnitude at the operating point."""
     inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
@@ -325,14 +342,14 @@ def _slowed(
     limit: Limit,
     least: Limit,
 ) -> tuple[Limit, str]:
-    """Reduce the bandwidth of a loop with springs or gravity until it respects the limits.
+    """Reduce the bandwidth of a loop with springs or gravity until it respects the effort limits.
 
-    The bandwidth is not reduced below `least`. Displacements `size` (m,) require efforts at the
-    start of the return. Displacements `driven` also require efforts during the return. `driven`
-    omits joints without a motor, because springs or gravity move them. The second result is a
-    report of the achieved loop.
+    The bandwidth is not reduced below `least`. The efforts at the start of the return are computed
+    for displacements `size` (m,). The efforts during the return are computed for displacements
+    `driven`, which are zero for joints without a motor, because springs or gravity move them. The
+    second result is a description of the achieved loop.
     """
-    # The limit that allows the smallest factor on the bandwidth, and the required inputs (nu,).
+    # Each trial has its bandwidth, the strictest effort limit, a report and the inputs (nu,).
     trials = list[tuple[Limit, Limit, str, Array]]()
     for _ in range(_TRIALS):
         Q, R = costs(limit.bandwidth)
@@ -363,7 +380,8 @@ def _slowed(
         trials.append((limit, left, said, np.abs(lin.u0) + use))
         if limit.bandwidth <= least.bandwidth:
             break
-        # Springs and gravity require efforts even if the loop is very slow.
+        # Springs and gravity require efforts even if the loop is very slow, so the bandwidth is
+        # reduced in steps.
         slower = min(max(left.bandwidth, 0.3), 0.8) * limit.bandwidth
         limit = max(left._replace(bandwidth=slower), least)
     if not trials:
@@ -381,20 +399,20 @@ def _slowed(
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the names of the coordinates that modes (nx, k) move most, weighted by inertia."""
+    """Return the names of the coordinates with the largest inertia-weighted motion in `modes`."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
     return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
-# Along a trajectory, displacements are _BESIDE times the displacements at a point. The bandwidth is
-# at least _CONSTANTS / duration, so that the displacements decay within the duration. It is at
-# least the bandwidth at a point, and at most _FASTEST. With held inputs, a bandwidth above the
-# limit at a point is allowed, because the sampled regulator is exact.
+# Along a trajectory, displacements are _BESIDE times the displacements at a point. The bandwidth
+# is _CONSTANTS / duration, so that the displacements decay within the duration. It is raised to
+# BANDWIDTH if it is lower, and reduced to _FASTEST if it is higher. If the inputs are held,
+# _HELD_ALONG replaces the stricter _HELD, because the sampled regulator includes the hold exactly.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 
 def pace_along(duration: float, hold: float) -> Pace:
-    """Return the pace of a loop along a trajectory of `duration` [s]."""
+    """Return the pace along a trajectory of `duration` [s], with inputs held for `hold` [s]."""
     return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fflin.linear.exchange import ToolGain
     from fflin.robot.robot import Robot
 
-# A gain with more entries than this, as for a robot with more than three joints, is not shown.
+# The report omits a gain with more entries than this, such as for a robot with more than 3 joints.
 _LARGE = 9 * 18
 
 # Relative accuracy of the largest gain over frequency.
@@ -41,7 +41,7 @@ _FRAGILE = 0.3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelDesign(Design):
-    """Design for a linear model x' = A x + B u; the model is sampled if dt [s] is not 0."""
+    """Design for a linear model ``dx/dt = A x + B u``, or for a sampled model if dt is not 0."""
 
     A: Array
     B: Array
@@ -122,11 +122,11 @@ class Gain(ModelDesign):
     regulated: tuple[str, ...]
     placement: Vector
     urdf_sha256: str
-    # The model of the design; files do not contain it.
+    # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
     def _report(self) -> str:
-        """Return the report: the gain, its poles, residual, margins, weights and warnings."""
+        """Return the report with the gain, poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
         head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
@@ -202,10 +202,11 @@ class Gain(ModelDesign):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        # The disk margin is 1/|(S - T)/2| at the inputs, each in units of sqrt(R_ii): Seiler,
-        # Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm follows from eigenvalues
-        # of Hamiltonian matrices instead of a grid of frequencies: Bruinsma and Steinbuch, Systems
-        # and Control Letters 14(4), 1990.
+        # The disk margin is the inverse H-infinity norm of half the difference between sensitivity
+        # and complementary sensitivity at the inputs. The inputs are scaled by sqrt(R_ii). See
+        # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm is computed from
+        # eigenvalues of Hamiltonian matrices, without a grid of frequencies. See Bruinsma and
+        # Steinbuch, Systems and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)
         scale = np.sqrt(self.R.diagonal())
         F, G, H = S @ self.closed_loop @ S.T, S @ self.B / scale, -scale[:, None] * self.K @ S.T
@@ -222,9 +223,10 @@ class Gain(ModelDesign):
 
 
 def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
-    """Return the model of a robot at the point stored with a gain, relative to a reference.
+    """Linearise a robot at the operating point of a gain, with states relative to `reference`.
 
-    If the robot has other states or inputs than the gain, the error begins with the text `made`.
+    If the states or inputs of the robot differ from those of the gain, raise an error whose message
+    begins with `made`.
     """
     from fflin.linear.linearization import linearize
 
@@ -246,7 +248,7 @@ def make_gain(
     N: Array | None,
     weights: str = "as given",
 ) -> Gain:
-    """Return the gain of a Riccati solution for a part of a model; other states get zero gain."""
+    """Return a model's gain from the Riccati solution of a `part`; other states get zero gain."""
     S = selection(part.state_names, lin.state_names)
     return Gain._of(
         solution,
@@ -333,7 +335,10 @@ class Margins(NamedTuple):
 
 
 def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
-    """Return the largest gain of a stable system, accurate to five digits, and its frequency."""
+    """Return the largest gain over frequency of a stable system, and the frequency [rad/s].
+
+    The gain is accurate to five digits.
+    """
 
     def gain(frequency: float) -> tuple[float, float]:
         response = D + C @ np.linalg.solve(1j * frequency * np.eye(len(A)) - A, B)
@@ -353,10 +358,11 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
 
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
-    """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and which are imaginary.
+    """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and a mask of imaginary ones.
 
-    At the frequency of each imaginary eigenvalue, the gain of the system equals the bound. An
-    eigenvalue that is wrongly counted as imaginary only costs one more evaluation of the response.
+    At the frequency of each imaginary eigenvalue, the gain of the system equals `bound`. The mask
+    may contain an eigenvalue that is not imaginary, which costs one more evaluation of the
+    response.
     """
     inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
     F = A + B @ inverse @ D.T @ C

@@ -1,4 +1,4 @@
-"""Kalman filters about a point and along a trajectory, and the LQG compensator."""
+"""Kalman filters, which estimate states about a point or along a trajectory, and LQG."""
 
 from __future__ import annotations
 
@@ -428,7 +428,7 @@ def tvkalman(
 def disturbance(
     of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
 ) -> tuple[Array, Array]:
-    """Return W (nw, nw), and the columns (.., nx, nw) through which the disturbance acts."""
+    """Return the matrix W (nw, nw) of a disturbance, and its input matrix (.., nx, nw)."""
     nx = len(of.state_names)
     if G is None:
         return weight("W", W, of.state_names), np.eye(nx)

@@ -1,4 +1,4 @@
-"""Output feedback by a linear system: a controller from another tool, a file or a compensator."""
+"""Output feedback by a linear system, which comes from another tool, a file or `lqg`."""
 
 from __future__ import annotations
 
@@ -27,12 +27,15 @@ from fflin.robot.robot import Robot
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
-# A pole counts as unstable if it grows faster than this fraction of the fastest pole.
+# A pole counts as unstable if its growth exceeds this times (1 + the largest pole magnitude).
 _ROUNDING = 1e-6
 
 
 class System(NamedTuple):
-    """State space A, B, C, D; dt [s] is 0 if continuous, -1 if unknown, None if not given."""
+    """State space A, B, C, D with names of its signals.
+
+    The sample time dt [s] is 0 in continuous time, -1 if it is unknown, and None if not given.
+    """
 
     A: Array
     B: Array
@@ -127,7 +130,7 @@ class LinearController(Feedback):
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _system_of(self.system)
-        # Expand the system to all outputs and inputs of the model, with the sign applied.
+        # Expand the system to all outputs and inputs of the model, and multiply it by the sign.
         columns = _indices("input", by.inputs, by.D.shape[1], "output", lin.output_names)
         rows = _indices("output", by.outputs, len(by.D), "input", lin.input_names)
         nz, (nu, ny) = len(by.A), lin.D.T.shape
@@ -211,7 +214,7 @@ class LinearController(Feedback):
 
 
 def growing(policy: object) -> tuple[str, ...]:
-    """Return warnings on unstable poles of a linear controller and of its linear loop."""
+    """Return warnings if a linear controller or its loop with the model has unstable poles."""
     said, by = list[str](), decider(policy)
     if not isinstance(by, LinearController):
         return ()
@@ -229,7 +232,7 @@ def growing(policy: object) -> tuple[str, ...]:
 
 
 def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
-    """Return the closed-loop matrix, dt [s] and state names of a policy with a linear loop."""
+    """Return the closed-loop matrix, dt [s] and state names, or None if the loop is not linear."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):
         own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
@@ -312,13 +315,13 @@ def _system_of(given: Any) -> System:
         for kind in ("input", "output")
     )
     dt = getattr(given, "dt", None)
-    # SciPy's continuous systems have no signal names, and dt is None.
+    # A system without signal names and with dt = None is a continuous system of SciPy.
     dt = 0.0 if dt is None and not inputs else dt
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
 def _checked(*given: Any) -> System:
-    """Return a system with consistent sizes; if A is empty, the system consists of D alone."""
+    """Return the system after a check of its sizes; if A is empty, it is the static gain D."""
     *matrices, dt, inputs, outputs = System(*given)
     defaults = (), (), (), 0.0
     A, B, C, D = (
@@ -371,7 +374,7 @@ def _read(path: Path) -> System:
 def _indices(
     kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
 ) -> list[int]:
-    """Return the indices of a controller's signals among the signals of a model."""
+    """Return the index in the model of each signal of a controller."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Linear quadratic regulators, by a Riccati equation or in closed form for accelerations."""
+"""Linear quadratic regulators from a Riccati equation, and `acceleration_lqr` in closed form."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, s
 from fflin.control.weights import Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
 
-# A relative residual above _COARSE gives a warning; above _USELESS, the gain is wrong.
+# A relative residual above _COARSE raises a warning, and one above _USELESS raises an error.
 _COARSE, _USELESS = 1e-8, 1e-3
 
 
@@ -247,7 +247,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
 def _diagonal(
     what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
 ) -> Array:
-    """Return the diagonal of a weight on `kept`, from values or names for all `names`."""
+    """Return the diagonal of a weight for the states `kept`, from a weight for all `names`."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(
             f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
@@ -288,7 +288,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None:
         return structured
-    # These checks name the mode that would make a general solver fail.
+    # If a mode would make a general solver fail, these checks raise an error that names the mode.
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

@@ -27,26 +27,26 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
-# Weights Q, R and Qf, and the name of the rule for Q and R.
+# Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST_ENTRIES = 20_000_000
 
-# Settings of DAQP for rows scaled to length 1, relative to the typical width of the limits. _EXACT
-# is the tolerance. _PRICE is the weight and _YIELDS the regularisation of soft limits. _VIOLATED is
-# the smallest violation to report.
+# Settings of DAQP, whose rows are scaled to length 1. _EXACT is the tolerance, relative to the
+# typical width of the limits. _PRICE is the weight of soft limits, and _YIELDS is their
+# regularisation. A relative violation below _VIOLATED is not reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
 # If the robot exceeds a limit by less than this fraction of the width between the limits, the
 # violation is not reported.
 _OVER = 1e-3
 
-# Violations of soft limits that the notes of a motion report.
+# The two kinds of soft-limit violations that the notes of a run report.
 _OF_PLANS, _OF_ROBOT = "plans that exceed", "samples at which the robot exceeds"
 
-# _OPEN is DAQP's infinity, _SOFT is its code of a soft limit, and _SOFTENED is its exit flag for a
-# plan that exceeds a soft limit. _MOST is the largest number of iterations.
+# Constants of DAQP. _OPEN is its infinity. _SOFT is its code for a soft limit. _SOFTENED is its
+# exit flag for a plan that exceeds a soft limit. _MOST is the largest number of iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
@@ -169,7 +169,7 @@ class _Predictive:
         return Receding(self.horizon, self.deviation(robot))
 
     def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
-        """Return the quadratic program at the error e (nx,), by default zero, and time t [s].
+        """Return the quadratic program for the error e (nx,) at time t [s]; e is zero by default.
 
         About a point, e is the deviation x - x0, and the program does not depend on t.
         """
@@ -220,7 +220,7 @@ class TrajectoryMpc(_Predictive, TrajectoryFeedback):
 def _unplanned(
     of: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
 ) -> Horizon:
-    """Return a horizon without stages, with the limits of a model's inputs, states and outputs."""
+    """Return a horizon that has the limits of a model's signals, but no stages."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
@@ -255,7 +255,7 @@ def _unplanned(
 
 
 def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
-    """Return the controller about a point, with the stages of the horizon `ahead`."""
+    """Design the controller about a point, and compute the stages of the horizon `ahead`."""
     (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
@@ -276,7 +276,7 @@ def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
 
 
 def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
-    """Return the controller along a trajectory, with the stages of the horizon `ahead`."""
+    """Design the controller along a trajectory, and compute the stages of the horizon `ahead`."""
     (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
@@ -290,7 +290,8 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
         for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
     ]
     for total, step, K, P, of, u in (*designs, last):
-        # Limits on the base pose apply to its error relative to the trajectory.
+        # The target of the base pose is zero, because its limits apply to the error relative to the
+        # trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
         stages.append(ahead.stage(total, step, K, P, of, u, x))
     stages += stages[-1:] * (ahead.samples - 1)
@@ -298,7 +299,10 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
 
 
 class Stage(NamedTuple):
-    """Stage e' = A e + B d with d = u - u*, and limits of E e' + D d; input limits come first."""
+    """One predicted sample: ``e' = A e + B d`` with ``d = u - u*``, and limits on ``E e' + D d``.
+
+    e and e' are the errors at the start and at the end of the sample. Input limits come first.
+    """
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)
@@ -311,7 +315,9 @@ class Stage(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """Quadratic program over d = u - u* of N samples: min d'H d / 2 + g'd, low <= G d <= high.
+    """Quadratic program over the inputs ``d = u - u*`` of N samples.
+
+    It minimises ``d'H d / 2 + g'd`` subject to ``low <= G d <= high``.
 
     Attributes
     ----------
@@ -342,10 +348,11 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return errors, z and limited values as linear functions of e_0 and of z or d.
+    """Return matrices that map inputs and the initial error to errors, z and limited values.
 
-    The matrices have N nu + nx columns. The first N nu columns multiply z if `planned` is True and
-    d otherwise. The last nx columns multiply e_0.
+    z is the scaled difference of the inputs from the regulator: ``d = L z - K e``. The matrices
+    have N nu + nx columns. The first N nu columns multiply z if `planned` is True, and d otherwise.
+    The last nx columns multiply the initial error.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
@@ -362,7 +369,7 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Samples of a run; near the end of the run, the horizon is the last N samples."""
+    """Stages of all samples of a run, with their limits; each plan covers N samples."""
 
     stages: tuple[Stage, ...]
     samples: int  # N
@@ -382,9 +389,10 @@ class Horizon:
     def stage(
         self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
     ) -> Stage:
-        """Return the stage of a sample from its cost, transition, gain, and the next sample's P.
+        """Return the stage of a sample with cost `total`, transition `whole` and gain K.
 
-        At the end of the sample, the target is the state `x` and the output of the model `of`.
+        P is the cost at the end of the sample. The limits are relative to the input `u`, the state
+        `x`, and the output of the model `of`.
         """
         (nx, nu), there = of.B.shape, np.concatenate((u, x, of.y0))[self.at]
         A, B = np.split(whole, [nx], axis=1)
@@ -394,25 +402,29 @@ class Horizon:
         return Stage(A, B, K, L, E, D, self.low - there, self.high - there)
 
     def window(self, t: float) -> tuple[Stage, ...]:
-        """Return the N samples from time t on."""
+        """Return the stages of N samples from time t on, or of the last N samples."""
         k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
         return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
-        """Return the lower and upper limits (m,) of stages, and which of these limits are soft."""
+        """Return the lower and upper limits (m,) of stages, and a mask of the soft limits."""
         soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
 
 
 class Receding:
-    """Policy that applies the first input of each plan; `at(t, q, v)` returns u* and e."""
+    """Policy that applies the first input of each plan.
+
+    `at(t, q, v)` returns the inputs u* of the reference and the error e.
+    """
 
     def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.unfinished = 0
-        # Violations of soft limits: their number, and the largest one with its description.
+        # For each kind of soft-limit violation: the number of violations, and the magnitude and
+        # description of the largest.
         self._violations = dict.fromkeys((_OF_PLANS, _OF_ROBOT), (0, 0.0, ""))
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
         if horizon.limited:  # now, so that the first sample is not slower
@@ -420,7 +432,7 @@ class Receding:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the run: plans, exceeded limits and failures of the solver."""
+        """Notes on the run: number of plans, violations of soft limits, and solver failures."""
         said = (
             f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
             f"{self.solves}"
@@ -443,7 +455,7 @@ class Receding:
         return command
 
     def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) relative to u* for the error e (nx,)."""
+        """Return the command minus the reference inputs (nu,), for the error e (nx,)."""
         stages, acting = self.of.window(t), self.of.acting
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
@@ -483,9 +495,9 @@ class Receding:
         return d
 
     def _record(self, what: str, t: float, excess: Array, unit: Array, least: float) -> None:
-        """Record by how much soft limits are exceeded in samples from time t [s] on.
+        """Record violations of soft limits in the samples from time t [s] on.
 
-        An excess counts if it is above `least` after multiplication by `unit`.
+        An excess counts as a violation if the product of `excess` and `unit` is above `least`.
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
         row, (count, most, said) = int(fractions.argmax()), self._violations[what]

@@ -24,11 +24,11 @@ from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
 from fflin.robot.robot import Robot
 
-# Tolerance [rad, m, s] of the goal, and of the limits of states at knots.
+# Largest error [rad, m, s] at the goal, and largest violation of state limits at the knots.
 _REACHED = 1e-7
 
-# Between knots, the motion may exceed a limit by this fraction. It is checked at the ends of _PARTS
-# equal parts of each interval.
+# A warning is given if the motion exceeds a limit by more than the fraction _BETWEEN. The motion is
+# checked at the ends of _PARTS equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
 
 
@@ -159,9 +159,10 @@ def plan(
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
     _require_within(shooting, bounds, "start", start, np.full(state.nx, True))
     _require_within(shooting, bounds, "goal", end, asked)
-    # A search without a solution may diverge; an error is then raised instead of NumPy warnings.
+    # NumPy's warnings are not needed, because an error is raised if the search diverges.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
-        # Weights of the knots in the integral: hold times, or the trapezoidal rule.
+        # Weights of the knots in the integral of the effort: the hold times of held inputs, or the
+        # weights of the trapezoidal rule.
         h, inputs = shooting.h, np.array((low, high))
         held = np.append(h, h[-1] if shooting.held else 0.0)
         held = held if shooting.held else 0.5 * (held + held[::-1])
@@ -184,7 +185,7 @@ def plan(
 
 
 class _Made(NamedTuple):
-    """Plan, with the end error and the limit violations of its integrated motion."""
+    """Plan, with the final error and the limit violations of the integrated motion."""
 
     q: Array
     v: Array
@@ -196,16 +197,16 @@ class _Made(NamedTuple):
 
     @property
     def reached(self) -> bool:
-        """Whether the motion meets the goal, and its knots are within the limits."""
+        """Whether the motion ends at the goal, and its knots are within the limits."""
         return max(self.missed.max(), self.at_knots.max()) <= _REACHED
 
 
 def _least(search: Search) -> _Made:
-    """Return the plan of least effort, or the plan that is closest to the goal and the limits."""
+    """Return the plan of least effort, with the smallest limit violations of all attempts."""
     shooting, bounds, cost, best = search.shooting, search.bounds, search.cost, None
     guess = shooting.guess(search.start, search.end)
     cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # the guess costs 1
-    # If the limits cannot be met between knots, the search is repeated with limits at the knots
+    # If the search with limits between the knots fails, it is repeated with limits at the knots
     # only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
         q, v, u, *_ = search._replace(cost=cost, parts=parts).best(*guess)
@@ -230,7 +231,7 @@ def _least(search: Search) -> _Made:
 def _require_within(
     shooting: Shooting, bounds: Array, what: str, point: Point, asked: Mask
 ) -> None:
-    """Raise `InputError` if a point is outside the limits of the states `asked`."""
+    """Raise `InputError` if one of the states `asked` of a point is outside its limits."""
     values, state = shooting.limited_values(*point), shooting.state
     outside = [
         f"{state.names[i]} is {values[i]:.4g} {state.units[i]}, limit {limit:.4g} {state.units[i]}"
@@ -243,7 +244,7 @@ def _require_within(
 
 
 def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
-    """Return the error for a failed search, with the errors and violations of its last trial."""
+    """Return the error for a failed search; it names the largest violations of the last trial."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
@@ -270,7 +271,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
 
 
 def _note(shooting: Shooting, made: _Made) -> str:
-    """Describe the largest violation of a state limit (nx,) by the integrated motion."""
+    """Describe the integrated motion's largest violation of a state limit."""
     most = "exceeds no state limit"
     if made.most > 0.0:
         k, part, i = np.unravel_index(made.beyond.argmax(), made.beyond.shape)
@@ -281,7 +282,10 @@ def _note(shooting: Shooting, made: _Made) -> str:
 
 
 def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Array) -> str:
-    """Return a line with the state or input of each group that is nearest to its limit (2, k)."""
+    """Describe the state or input of each group that is nearest to its limit.
+
+    `limits` (2, k) contains the lower and upper limits of all states and inputs.
+    """
     state, values = shooting.state, np.hstack((shooting.limited_values(made.q, made.v), made.u))
     names, units = state.names + input_keys(actuation), state.units + actuation.units
     bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))

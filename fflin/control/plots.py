@@ -21,16 +21,17 @@ _LINE = "#888888"
 
 _POINTS = 400
 
-# Vertical offsets of the tests, so that the points of two independent computations do not overlap.
+# Vertical offset of the points of each test. Without it, the points of two independent computations
+# would overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
-# A gain factor below this counts as zero, because an integrator has infinite gain at zero
-# frequency.
+# A gain factor below this counts as zero. Such a factor occurs because an integrator has infinite
+# gain at zero frequency.
 _NOTHING = 1e-6
 
 
 class LoopMargins(NamedTuple):
-    """Phase margin [deg] of a loop, and the range of gain factors for which the loop is stable."""
+    """Phase margin [deg] of a loop, and the gain factors between which the loop is stable."""
 
     phase: float
     gain: tuple[float, float]
@@ -150,7 +151,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
 
 def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
-    """Draw a shape as bars on its line: the real part filled, the modulus outlined."""
+    """Draw a mode shape as bars: filled bars for real parts, outlined bars for magnitudes."""
     x, height = np.arange(len(shape)), -0.45  # the axis points down
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)
@@ -279,7 +280,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
             loc="outside right upper",
             fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
         )
-        # Discrete-time poles crowd near 1, so their rates ln(z)/dt are drawn.
+        # Discrete-time poles z lie close together near 1, so their rates ln(z)/dt are drawn.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
         poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
@@ -296,9 +297,9 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
 
 
 def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
-    """Return frequencies (k,) [rad/s], the loop gains (k, nu) of the inputs, and their margins."""
-    # With T = K (s I - A + B K)^-1 B, the loop gain of input i is T_ii / (1 - T_ii). For a sampled
-    # model, s is e^(j w dt).
+    """Return frequencies (k,) [rad/s], the loop gain (k, nu) at each input, and its margins."""
+    # The loop gain of input i is T_ii / (1 - T_ii), with T = K (s I - A + B K)^-1 B. Here s is j w,
+    # or e^(j w dt) for a sampled model.
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
     F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
 
@@ -314,7 +315,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the responses of loop i at which the function `value` changes its sign."""
+        """Return the gains of loop i at the frequencies where `value` changes its sign."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))
@@ -323,7 +324,8 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         return [complex(response(w)[i]) for w in found]
 
     loops = []
-    # At both ends of the frequency axis, the loop gain is real and its phase may be -180 deg.
+    # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real, so
+    # its phase may be -180 deg.
     ends = [response(0.0)] + [values[-1]] * bool(dt)
     for i in range(len(K)):
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)

@@ -24,7 +24,7 @@ from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Function of t, q and v that returns the inputs u* of a reference, and the error e from it.
+# Function of t, q and v that returns the inputs u* of a reference, and the error e relative to it.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
 
 
@@ -35,12 +35,12 @@ class Gridded(Protocol):
     lin: LinearModel
 
     def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the grid axes {joint: values} and the gains (N, nu, nx) in grid order."""
+        """Return the values of each joint on the grid, and the gains (N, nu, nx) in grid order."""
         ...
 
 
 class Feedback:
-    """Feedback of states or outputs about the operating point of a model, or along a motion."""
+    """Feedback of states or outputs, about an operating point or along a motion."""
 
     lin: LinearModel
 
@@ -51,7 +51,7 @@ class Feedback:
         return state
 
     def deviation(self, robot: Robot) -> Deviation:
-        """Return f(t, q, v) -> u*, e: the inputs of the reference, and the error from it."""
+        """Return a function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
         fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
         near[fed] = lin.x0
@@ -195,7 +195,7 @@ class AllocatedPolicy:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on a motion: which inputs are commanded, and which inputs realise the commands."""
+        """Notes on a run: how the commands are realised, and the notes of the inner policy."""
         asked, given = (
             list(dict.fromkeys(group_of(key) for key in input_keys(each)))
             for each in (self._design, self._robot)
@@ -205,7 +205,7 @@ class AllocatedPolicy:
         return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the inputs (nu,) whose force is nearest to the force of the inner policy."""
+        """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
         asked, given = self._states
         u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
@@ -220,7 +220,7 @@ class AllocatedPolicy:
 
 
 class Clock:
-    """Sampling clock of a controller with an internal state; the sample time is `dt` [s]."""
+    """Check that a controller with an internal state is called once per sample time `dt` [s]."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._last = dt, -np.inf
@@ -237,9 +237,10 @@ class Clock:
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the state index of each output, and the gyroscopes, whose indices follow the states.
+    """Return an index for each output, and the list of gyroscopes.
 
-    Other sensors raise `InputError`.
+    The index of an output is the index of a state. The rates of the gyroscopes are numbered after
+    the states. Other sensors raise `InputError`.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
@@ -255,9 +256,10 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
 
 
 class Sample(NamedTuple):
-    """Law u = u0 + C (z + jump) + D dy with dy = y - y0.
+    """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
 
-    The next z, or dz/dt in continuous time, is A (z + jump) + B dy.
+    ``A (z + jump) + B (y - y0)`` is the next z of a sampled controller, or dz/dt of a continuous
+    controller. `jump` is the change of z if the reference changes.
     """
 
     A: Array
@@ -278,7 +280,7 @@ class Sample(NamedTuple):
 
 
 class Loop:
-    """Policy that measures a robot's outputs relative to a reference, for a compensator.
+    """Policy that measures a robot's outputs and computes the command with a compensator.
 
     The compensator's state z advances at each sample, or at each stage if dt is 0.
     """
@@ -302,7 +304,7 @@ class Loop:
         self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
 
     def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return the law at a sample, and the chart and state relative to which y is measured."""
+        """Return the law at time t, and the chart and state relative to which y is measured."""
         measure, near = self._there(t)
         return self.at(t), measure.state, near
 
@@ -342,7 +344,7 @@ class Loop:
         return found
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Integrate z to the next stage: sum `weights` times the step's first z and its rates."""
+        """Set z at the next stage to the weighted sum of the step's first z and its rates."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
@@ -350,12 +352,12 @@ class Loop:
 
 
 def decider(policy: object) -> object:
-    """Return the policy that computes the commands: for an allocation, its inner policy."""
+    """Return the inner policy of an allocation, or the policy itself."""
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
 def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
-    """Return the frame and reference of a policy's state and inputs, or None if unknown."""
+    """Return the frame and the reference of a policy's states; each is None if unknown."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference

@@ -23,7 +23,7 @@ from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# Times within this factor of the end count as the end, because sums of many time steps are rounded.
+# A time up to this factor times the end counts as the end, because sums of time steps are rounded.
 AT_THE_END = 1.0 + 1e-9
 
 # Function that returns q, v and u, in the policy's axes, at a time of the run.
@@ -204,7 +204,7 @@ class TrajectoryFeedback(Feedback):
 
 
 def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
-    """Return the policy to simulate, with commands held for `held` [s].
+    """Return the policy to simulate; commands are held for `held` [s], or continuous if it is 0.
 
     A gain schedule is replaced by the feedback along its trajectory.
     """
@@ -226,7 +226,7 @@ def reference_of(policy: object) -> Reference | None:
 
 
 def tracking_of(policy: object) -> TrajectoryFeedback | None:
-    """Return the trajectory feedback in a policy or in its allocation, or None."""
+    """Return a policy, or the inner policy of an allocation, if it is a trajectory feedback."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
@@ -234,8 +234,8 @@ def tracking_of(policy: object) -> TrajectoryFeedback | None:
 @lru_cache(maxsize=2)  # saves half the time of a short run
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the 95th percentile over time of the largest pole magnitude [1/s]; 0 if sampled."""
-    # The percentile excludes the short time in which a large final weight makes K large. The
-    # integration step may be too long for this time.
+    # The percentile excludes the short time at the end during which a large final weight makes K
+    # large. During this time, the integration step may be too long.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
@@ -317,7 +317,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
-        """Model at rest after the end, and the gain of its steady-state filter."""
+        """Model of the robot at rest after the end, and the gain of the steady-state filter."""
         lin, seen = self.end.discretize(self.filter.dt), self.filter
         return lin, kalman(lin, seen.W[-1], seen.V).L
 
@@ -326,15 +326,16 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         k, jump = round(t / dt), np.zeros(len(seen.state_names))
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
-            # A held input approximates a changing input best if it has the value at the middle of
-            # the sample.
+            # A held input approximates a changing input best with the value at the middle of the
+            # sample.
             u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
             y = seen.y[k]
         else:
             (lin, L), K = self._rest, self.end_gain
             A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0
             if k == len(seen.A):
-                # From this sample on, the error is relative to the robot at rest.
+                # At this sample, the reference changes from the trajectory to the robot at rest, so
+                # the velocity error jumps.
                 stop = self.reference(self.duration)[1] - lin.v
                 jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
         return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

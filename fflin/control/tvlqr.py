@@ -1,4 +1,4 @@
-"""Time-varying regulator along a trajectory, and schedules of gains of regulators and filters."""
+"""Time-varying regulator along a trajectory, and gain schedules of regulators and filters."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Schedule(ModelDesign):
 
     @cached_property
     def starts(self) -> list[float]:
-        """Times at which the intervals between knots, or the samples, begin."""
+        """Start times of the intervals between knots, or start times of the samples."""
         # A sample starts slightly before its nominal time, because times are rounded.
         late = np.append(self.t[0], self.t[1:] - 1e-9 * self.dt)
         starts: list[float] = (late if self.dt else self.t[:-1]).tolist()
@@ -117,7 +117,7 @@ class GainSchedule(Schedule):
     frame: str
 
     def _report(self) -> str:
-        """Return the report: the sizes, the residual and the rule of the weights."""
+        """Return the report with the sizes, the residual and the rule of the weights."""
         return folded([repr(self), f"weights: {self.weights or 'as given'}"])
 
     def trajectory(self, robot: Robot) -> Trajectory:
@@ -165,7 +165,7 @@ class GainSchedule(Schedule):
         """Coefficients (M - 1, 7, nu nx) of K, for powers of the time since the last knot."""
         from scipy.interpolate import CubicSpline
 
-        # Between knots, P is a cubic and B is a spline, and K = R^-1 B' P.
+        # Between knots, P and B are cubics of time, so K = R^-1 B' P has degree 6.
         of_B = CubicSpline(self.t, self.B).c[::-1]
         pieces = np.zeros((7, *of_B[0].mT.shape))
         for power, reach in enumerate(np.linalg.solve(self.R, of_B.mT)):
@@ -375,7 +375,7 @@ def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool
 def held_stages(
     traj: LinearTrajectory, dt: float, Q: Array, R: Array
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield the cost and the transition of each sample, from first to last."""
+    """Yield the cost matrix and the transition matrix of each sample, from first to last."""
     nx, W = len(Q), block_diag(Q, R)
     for steps, whole in transitions(traj, dt):
         total, transition = np.zeros_like(W), np.eye(len(W))
@@ -386,7 +386,7 @@ def held_stages(
 
 
 def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
-    """Return the sampling time [s] of a design along a continuous trajectory, 0 if not sampled."""
+    """Return the sampling time [s] of a design along a continuous trajectory; 0 by default."""
     expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
@@ -408,7 +408,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest in the last configuration, in base axes; rotors keep spinning."""
+    """Return the model at rest at knot `end`, in base axes; rotors keep spinning."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
@@ -420,7 +420,7 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
 def steady_regulator(
     lin: LinearModel, Q: Array, R: Array, sample: float | None
 ) -> tuple[Array, Array]:
-    """Return the cost P (nx, nx) and K (nu, nx) of a regulator about a steady point."""
+    """Return the cost P (nx, nx) and the gain K (nu, nx) of a regulator about a steady point."""
 
     def regulator(lin: LinearModel, Q: Array) -> Gain:
         if not sample:

@@ -1,4 +1,4 @@
-"""Weights of a quadratic cost from matrices, diagonals, numbers or names, or by a rule."""
+"""Weights of a quadratic cost, which are given by the user or computed by a rule."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,10 +25,11 @@ from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
 
-# A weight from the user, its name or pattern, and whether it is a largest value (Bryson).
+# A weight from the user, its name or pattern, and whether it was given as a largest value (Bryson).
 _Given: TypeAlias = tuple[float, str, bool]
 
-# A relative asymmetry or a negative eigenvalue is rounding error if its magnitude is below this.
+# An asymmetry or a negative eigenvalue of a weight is rounding error if its magnitude, relative to
+# the largest entry, is below this.
 _ROUNDING = 1e-9
 
 # Bandwidth with which wheel speeds are regulated, as a fraction of the bandwidth of the loop.
@@ -99,14 +100,14 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
 
 
 def inverse_square(what: str, size: float) -> float:
-    """Return 1/size^2, or raise `InputError` if it is not a positive finite number."""
+    """Return ``1 / size^2``, or raise `InputError` if `size` is not positive and finite."""
     if not 1e-150 <= size <= 1e150:
         raise InputError(f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150")
     return size**-2
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
-    """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
+    """Return a weight (k, k) from a matrix, a diagonal, a number, or numbers by name or pattern."""
     size, rounding = len(names), 0.0
     if isinstance(value, Mapping):
         matrix = np.diag(_diagonal(what, value, names, complete=definite))
@@ -134,7 +135,8 @@ def require_semidefinite(
 ) -> None:
     """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite.
 
-    A negative eigenvalue that is smaller than `rounding` times the largest entry is permitted.
+    A negative eigenvalue is permitted if its magnitude is at most `rounding` times the largest
+    entry. If `definite` is True, the matrix must be positive definite.
     """
     try:
         np.linalg.cholesky(matrix)  # quicker than eigenvalues
@@ -258,9 +260,13 @@ def rule_weights(
     wheel_speeds: bool | None = None,
     pace: Pace | None = None,
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N by a rule, changed by `given` weights, and a description of the rule."""
-    # If the continuous model is known, the cost of a sampled model is the continuous cost with
-    # held inputs. The rule is set by the robot's `weights`; by default it is "urdf".
+    """Return Q, R and N by a rule, and a description of the rule.
+
+    `given` weights replace weights of the rule.
+    """
+    # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
+    # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
+    # the rule; if they do not, it is "urdf".
     source = lin.generator or lin
     layers = [(given, False)] if given else []
     if name is None and lin.weights:
@@ -299,10 +305,10 @@ def rule_weights(
 def _of_regulated(
     lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str, Array]:
-    """Return Q (nx, nx), R, the rule and the costs, for a model that may have wheels.
+    """Return Q (nx, nx), R, the rule and the costs (nx + nu,), for a model that may have wheels.
 
-    The costs (nx + nu,) are the contributions of each state and input at its largest value. They
-    are 0 if the rule has no largest values.
+    The cost of a state or input is its contribution at its largest value. It is 0 if the rule has
+    no largest value for it.
     """
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
@@ -324,8 +330,8 @@ def _of_regulated(
     terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Z spans the null space of the scaled forces. For any vector n, the inputs R^-1/2 Z n
-        # rotate no body and change the wheel speeds at the rates X n.
+        # The inputs that exert no force on the robot without its wheels form a null space. Inputs
+        # with coordinates n in this null space change the wheel speeds at the rates X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
@@ -336,7 +342,7 @@ def _of_regulated(
 def _weights_of(
     lin: LinearModel, given: Mapping[str, Mapping[str, float]], of_robot: bool
 ) -> dict[int, _Given]:
-    """Return {index: given weight}, with states before inputs."""
+    """Return the given weights by index; the indices of inputs follow the indices of states."""
     states, inputs = lin.state_names, input_keys(lin)
     found, every = dict[int, _Given](), (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)

@@ -1,1 +1,1 @@
-"""C code of control laws for flight software, and its simulation in the loop."""
+"""C code of control laws for flight software, and simulation with this code in the loop."""

@@ -1,4 +1,4 @@
-"""C code of a control law: its source, header and test program, and a policy that calls it."""
+"""C code of a control law (source, header, test program), and a policy that calls the code."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Largest accepted rounding error in double precision, relative to the magnitudes of the terms.
+# Largest rounding error that the test program accepts in double precision, relative to the
+# magnitudes of the terms.
 _DOUBLE_ERROR = 1e-14
 
 _INVALID = 2  # status of a step with invalid arguments
@@ -136,7 +137,7 @@ def write_c(
 
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
-    """Return the digest that shows whether a law's description and code belong together."""
+    """Return a digest of a law's description and code, to detect a change in any of them."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
 
@@ -293,10 +294,10 @@ class _OutputLoop(Loop):
         self._law, self._u0 = law, np.array(about["u0"])
 
     def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command of a sample, and the next state.
+        """Return the command of a sample, and the next state of the controller.
 
-        Outputs are measured twice, because an accelerometer measures accelerations under this
-        command.
+        The code is called twice, because accelerometer outputs depend on the command. The first
+        call computes the command under which the second call's outputs are measured.
         """
         real, u = self._law._real, self._u0
         for _ in range(2):
@@ -335,12 +336,12 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
 
 
 def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
-    """Return the title of a law, and {ending: text} of its files, made from the templates."""
+    """Return the title of a law, and the text of each of its files by file ending."""
     state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
     names, units = law.inputs
     kind, title = "state" if state else "output", f"{law.title} of '{robot.name}'"
     frame = state.frame if state else lin.frame if lin else ""
-    # For single precision, the bound is the unit roundoff times the number of operations.
+    # For single precision, the accepted error is the unit roundoff times the number of operations.
     error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
     bounds = error * np.max([case.scale for case in law.cases], axis=0)
     sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
@@ -398,7 +399,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
-    """Return the words of a state law alone."""
+    """Return the words that the templates of a state law need in addition."""
     n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
     words: dict[str, object] = {
         **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
@@ -452,12 +453,12 @@ def _array(values: Array, real: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Replace the characters of a text that may be invalid in comments and strings of C."""
+    """Replace the characters of a text that may be invalid in a C comment or a C string."""
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 
 def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
-    """Return the lines of a C comment with index, name and unit of each entry of an array."""
+    """Return the lines of a C comment that give the name and unit of each entry of an array."""
     return "\n".join(
         f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))

@@ -1,4 +1,4 @@
-"""Control laws as the tables that the C code contains, with test cases computed by fflin."""
+"""Conversion of control laws to the tables of their C code, with test cases from fflin."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -31,9 +31,10 @@ OfStates: TypeAlias = Gain | StateFeedback | Gridded | GainSchedule | Trajectory
 
 
 class Case(NamedTuple):
-    """Test case: arguments `given` of a step, its results `out`, and the scale of rounding errors.
+    """Test case with the arguments `given` of a step, and its results `out`.
 
-    The error of `out` is at most the unit roundoff times `scale` times the number of operations.
+    The rounding error of `out` is at most the product of the unit roundoff, `scale` and the number
+    of operations.
     """
 
     sample: int
@@ -44,11 +45,11 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """Control law as the tables of its C code, with test cases.
+    """Tables of the C code of a control law, and test cases.
 
-    A state law is u = u0 - K (x - x0), with one row of tables, or a row for each sample. With the
-    table `axis_points`, K is interpolated between the points of a grid of joint positions. An
-    output law is u = u0 + C z + D (y - y0), after which z becomes A z + B (y - y0).
+    A state law is ``u = u0 - K (x - x0)``. Its tables have one row, or one row for each sample. If
+    there is a table `axis_points`, K is interpolated on a grid of joint positions. An output law is
+    ``u = u0 + C z + D (y - y0)``; the next z is ``A z + B (y - y0)``.
     """
 
     title: str
@@ -65,9 +66,9 @@ class Law:
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
-    """Return the arguments (13 + 2n,) of a state law at a valid q and v, in the order of C.
+    """Return the arguments (13 + 2n,) of the C code of a state law, for valid q and v.
 
-    `world` is the state map relative to the world.
+    `world` is the robot's state map relative to the world.
     """
     attitude, nu = quaternion_product(world.origin_quaternion, q[3:7]), world.velocities(v)
     pose = attitude, world.positions(q), world.joint_positions(q)
@@ -75,7 +76,7 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
 
 def law_of(given: object, robot: object, limits: object) -> Law:
-    """Convert a policy or design to the tables of a law; `limits` are as in `simulate`."""
+    """Convert a policy or design to the tables of a law, with `limits` as in `simulate`."""
     if isinstance(given, TrajectoryOutputFeedback) or not isinstance(
         given, OfStates | LinearController | Compensator
     ):
@@ -149,13 +150,13 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
 def _state_cases(
     state: StateMap, policy: Policy, dt: float, tables: dict[str, Array], axes: dict[str, Array]
 ) -> Iterator[Case]:
-    """Yield test cases at random and near-singular states, with the inputs of the policy."""
+    """Yield test cases at random and near-singular states; the policy computes the results."""
     random, n, turning = np.random.default_rng(0), state.robot.n, state.unbounded
     world = StateMap(state.robot, frame=state.frame)
     for index in range(CASES):
         row = index % len(tables["x0"])
         x0, u0, about = (tables[key][row] for key in ("x0", "u0", "reference"))
-        # A random state near x0 with the base at the reference; the base's pose is set afterwards.
+        # The state is random near x0. The base is at the reference; a random pose is set below.
         x = x0 + random.normal(scale=10.0 ** random.uniform(-4, 0), size=state.nx)
         x[:6] = 0.0
         turns = np.zeros(n)
@@ -180,7 +181,7 @@ def _state_cases(
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
-        # Magnitudes of the terms whose sum is a state.
+        # Sum of the magnitudes of the terms from which each entry of x - x0 is computed.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
         rates = np.repeat((norm(omega), norm(v)), 3)
@@ -191,7 +192,7 @@ def _state_cases(
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise a robot at the point and reference stored with a gain that was read from a file."""
+    """Linearise a robot at the operating point and reference of a gain from a file."""
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
@@ -217,7 +218,7 @@ def _limits(robot: Robot, limits: object, names: Sequence[str]) -> dict[str, Arr
 
 
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
-    """Return the tables with one row for each sample; the last row acts after the trajectory."""
+    """Return tables with one row for each sample; the last row applies after the trajectory."""
     if not (dt := policy.schedule.dt):
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
@@ -278,7 +279,7 @@ def _output_law(
 
 
 def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
-    """Yield test cases at random controller states and outputs, with u and the next z."""
+    """Yield test cases at random controller states and outputs; the results are u and next z."""
     random, (nz, ny) = np.random.default_rng(0), by.B.shape
     for _ in range(CASES):
         size = 10.0 ** random.uniform(-4, 0)

@@ -1,1 +1,1 @@
-"""Solvers of optimal control problems: Riccati equations, and programs over a motion's stages."""
+"""Solvers of optimal control problems: Riccati equations, and nonlinear trajectory planning."""

@@ -1,4 +1,4 @@
-"""Differential Riccati equation, solved backwards in time with P positive semidefinite."""
+"""Solver of differential Riccati equations, backwards in time; P stays positive semidefinite."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 
-# Number of intervals per batch; a NumPy call for many small matrices takes little longer than for
-# one.
+# Number of intervals per batch. Batches save time, because a NumPy call for many small matrices
+# takes little longer than a call for one.
 _BATCH = 64
 
 
 class Coefficients(NamedTuple):
-    """Coefficients A, S = B R^-1 B' and Q (.., nx, nx) of -dP/dt = A' P + P A - P S P + Q."""
+    """Coefficients (.., nx, nx) of ``-dP/dt = A' P + P A - P S P + Q``, with ``S = B R^-1 B'``."""
 
     A: Array
     S: Array
@@ -37,10 +37,10 @@ class Coefficients(NamedTuple):
 
 
 class Transition(NamedTuple):
-    r"""Solution of the Hamiltonian system over intervals: x1 = T x0 - G l1, l0 = W x0 + T' l1.
+    r"""Solution of the Hamiltonian system over intervals.
 
-    G and W are positive semidefinite. x is the state and l the costate at the start (0) and at the
-    end (1) of an interval.
+    The solution is ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1``, with the states x0, x1 and the
+    costates l0, l1 at the start and at the end of an interval. G and W are positive semidefinite.
     """
 
     T: Array
@@ -61,10 +61,10 @@ class Transition(NamedTuple):
         )
 
     def back(self, P: Array) -> Array:
-        """Return P at the start, W + T' P (I + G P)^-1 T, from P at the end."""
+        """Return P at the start of the interval, W + T' P (I + G P)^-1 T, from P at its end."""
         forward = np.linalg.solve(np.eye(len(P)) + self.G @ P, self.T)
         costate = P @ forward
-        # This form is a sum of squares, so P stays positive semidefinite.
+        # Every term is positive semidefinite, so P stays positive semidefinite.
         return _symmetric(self.W + forward.T @ costate + costate.T @ self.G @ costate)
 
 
@@ -80,13 +80,13 @@ def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
 
 
 def _constant(coefficients: Coefficients, h: Array) -> Transition:
-    """Return transitions for constant coefficients, by scaling and doubling an exponential."""
+    """Return transitions for constant coefficients, by a matrix exponential and doubling."""
     A, S, Q = coefficients
     n, (a, s, q) = A.shape[-1], (np.abs(x).max(axis=0) for x in coefficients)
     sizes = np.block([[a, s], [q, a.T]])
     if not sizes.max() < 1e300:
         raise np.linalg.LinAlgError("the coefficients are too large")
-    # Units of the states that give rows and columns similar sizes; costates have the inverse units.
+    # Scale the states so that rows and columns have similar sizes; costates get inverse scales.
     _, (scale, _) = matrix_balance(sizes, permute=False, separate=True)
     unit = np.sqrt(scale[:n] / scale[n:])
     A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
@@ -108,13 +108,13 @@ def _constant(coefficients: Coefficients, h: Array) -> Transition:
     return Transition(T * unit[:, None] / unit, G * scale, W / scale)
 
 
-# Start and end of an interval, its transitions through the whole, the first half and the second
-# half, and the coefficients at both ends.
+# An interval: its start and end, its transitions (over the whole interval, the first half, and the
+# second half), and the coefficients at both ends.
 _Interval = tuple[float, float, Transition, Transition, Transition, Coefficients, Coefficients]
 
 
 def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Interval]:
-    """Return the intervals between knots (k + 1,)."""
+    """Return the k intervals between knots (k + 1,), with their transitions."""
     a, b, count = knots[:-1], knots[1:], len(knots) - 1
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
@@ -129,7 +129,7 @@ def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Inter
 
 
 def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Return times, and P at these times, integrated backwards from the last knot.
+    """Integrate P backwards from the last knot, and return the times and the values of P.
 
     `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, raise
     `LinAlgError`.
@@ -141,17 +141,16 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
         while pending:
             start, end, whole, early, late, at_start, at_end = pending.pop()
             P, middle, error = values[-1], 0.5 * (start + end), math.inf
-            # If the coefficients of a long step are indefinite, the solution fails and shorter
-            # steps are tried.
+            # A long step may fail because its coefficients are indefinite. Shorter steps are then
+            # tried.
             with suppress(np.linalg.LinAlgError):
                 single, half = whole.back(P), late.back(P)
                 double = early.back(half)
                 # `between` is the value of the Hermite cubic at the middle of the interval.
                 bend = at_start.rate(double) - at_end.rate(P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
-                # The error of two half steps is a sixteenth of the error of one whole step, so it
-                # is a fifteenth of their difference. To be safe, a quarter of the difference is
-                # assumed.
+                # The method has fourth order, so the error of two half steps is a fifteenth of
+                # their difference from one whole step. To be safe, a quarter is assumed.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]
@@ -164,14 +163,14 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
 
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
-    """Return K and P of the samples, the last sample first, and the largest residual."""
-    # A stage has the cost matrix (nx + nu, nx + nu) of the error and the input at the start of a
-    # sample, and the matrix (nx, nx + nu) that maps both to the next error.
+    """Return K and P from the last sample to the first, and the largest relative residual."""
+    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost of the error and the
+    # input at the start of a sample. The second (nx, nx + nu) maps them to the next error.
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole
         K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-        # This form is a sum of squares, so P stays positive semidefinite.
+        # `total` is positive semidefinite, so this form keeps P positive semidefinite.
         law = np.vstack((np.eye(nx), -K))
         P = _symmetric(law.T @ total @ law)
         if not np.isfinite(P).all():
@@ -184,9 +183,9 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
 
 @contextmanager
 def bounded_by(remedy: str) -> Iterator[None]:
-    """Raise `InputError` with a `remedy` if P changes too fast."""
+    """Raise `InputError`, which recommends `remedy`, if P changes too fast."""
     try:
-        # If P overflows, an error is raised, so NumPy's warnings are not needed.
+        # NumPy's warnings are not needed, because an overflow of P raises an error.
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError:
@@ -201,7 +200,10 @@ def spread(B: Array, R: Array) -> Array:
 
 
 def imbalance(terms: Array) -> float:
-    """Return the largest norm of a sum (.., n, n), relative to the norms of its terms."""
+    """Return the largest norm of a sum of matrices, relative to the norms of the terms.
+
+    `terms` (k, .., n, n) contains the k terms of each sum.
+    """
     size = np.linalg.norm(terms, axis=(-2, -1)).sum(axis=0)
     sums = np.linalg.norm(terms.sum(axis=0), axis=(-2, -1))
     return float((sums / np.maximum(size, 1e-300)).max())

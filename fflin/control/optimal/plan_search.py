@@ -9,44 +9,46 @@ from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, Indices, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 
-# Accuracy [rad, m, s] with which the goal and the limits are met.
+# A plan is accepted if the sum of its violations [rad, m, s] of goal and limits is at most this.
 _ENDS = 1e-8
 
-# A state is limited at a point within an interval once an iterate exceeds the limit there by the
-# fraction _LIMITED. The limit is tightened by the fraction _TIGHTER, because the motion may exceed
-# it between the points.
+# A point within an interval gets a limit once an iterate exceeds the limit at this point, or at a
+# neighbour, by the fraction _LIMITED. The limit is tightened by the fraction _TIGHTER, because the
+# motion may exceed it between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
-# If no gap exceeds this, the intervals are integrated as one motion.
+# If no gap exceeds this, the gaps count as closed, and the plan is integrated as one motion.
 _MEETS = 1e-10
 
-# If the total error of a single motion exceeds half of this, the error is not corrected.
+# After a plan is integrated as one motion, its violations are corrected only if their sum is at
+# most half of this.
 _NEARLY = 1e-3
 
-# _SEEKS is the integration accuracy of interval ends during the search, and _FLIES is the accuracy
-# at the end of the search.
+# Integration accuracy of interval ends: _SEEKS during the search, and _FLIES while the gaps are
+# closed.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# The search ends if an iteration saves less than the fraction _SAVED of the effort, or after _MOST
-# iterations.
+# The search ends after _MOST iterations, or if the predicted reduction of the merit function is
+# less than the fraction _SAVED.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
-# Cost of a step of wheel states relative to other states; it is small, because wheels may have any
-# state.
+# Cost of a change of wheel angles and rates in an iteration, relative to the cost for other states.
+# It is small, because wheels may have any angle and rate.
 _OF_WHEELS = 1e-6
 
-# The search also ends if the quadratic programs violate the goal or limits at the knots by more
-# than _HOPELESS [rad or m], and this violation does not fall by a tenth in _STAGNANT iterations.
-# Smaller violations come from the finite penalty, and vanish when the gaps are closed.
+# The search also ends if the solutions of the quadratic programs violate the goal or the limits at
+# the knots by more than _HOPELESS [rad or m], and if this violation does not fall by a tenth in
+# _STAGNANT iterations. Smaller violations are due to the finite penalty. They vanish when the gaps
+# are closed.
 _STAGNANT, _HOPELESS = 10, 1e-2
 
-# Penalty on a violation of the goal or a limit by 1 rad or 1 m, relative to the effort of the
-# guess.
+# Penalty for a violation of the goal or a limit by 1 rad or 1 m. The unit of the penalty is the
+# cost of the initial guess.
 _PRICE = 1e3
 
 
 class Trial(NamedTuple):
-    """Trial: knots, inputs, gaps between intervals, and distances of states from their limits."""
+    """Knots and inputs of a trial, its gaps, and the distances of its states from limits."""
 
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
@@ -68,8 +70,8 @@ class Trial(NamedTuple):
 class Search(NamedTuple):
     """Search for the inputs of least effort from a start state to an end state."""
 
-    # The Hessian is the Gauss-Newton approximation. Steps of the states also have a cost, which is
-    # reduced while full steps succeed (Levenberg-Marquardt).
+    # The Hessian is the Gauss-Newton approximation. Steps of the states have an additional cost,
+    # which is reduced if a full step succeeds (Levenberg-Marquardt).
 
     shooting: Shooting
     start: Point
@@ -83,9 +85,9 @@ class Search(NamedTuple):
     report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> Trial:
-        """Return the trial of least effort, or closest to the end state.
+        """Return the trial of least effort, or the motion of the last inputs if the search fails.
 
-        The search begins at the given knots and inputs.
+        The search begins at the knots q, v and the inputs u.
         """
         shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
@@ -107,7 +109,7 @@ class Search(NamedTuple):
             left.append(at_knots)
             if _stagnates(left):
                 return self._flown(trial.u)
-            # The multipliers determine the penalty on gaps (Powell).
+            # Powell's rule sets the penalty on gaps from the multipliers.
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
             saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
@@ -126,7 +128,7 @@ class Search(NamedTuple):
         return self._closed(trial, limited, first, left)
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
-        """Report the cost relative to the guess, and the largest violation."""
+        """Report the cost relative to the cost of the guess, and the largest violation."""
         cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
         self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
@@ -143,7 +145,7 @@ class Search(NamedTuple):
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
-        """Return whether points (N, parts - 1, nx) or their neighbours exceed a limit."""
+        """Return a mask (N, parts - 1, nx) of points that exceed a limit, and their neighbours."""
         beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self.size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
@@ -153,9 +155,10 @@ class Search(NamedTuple):
     def _step(
         self, trial: Trial, limited: Mask, near: Array, effort: Array
     ) -> tuple[Array, Array, Array, float, float] | None:
-        """Return the optimal step of knots and inputs, its multipliers and its violations.
+        """Return the optimal step of the knots and inputs, or None if there is none.
 
-        The violations are their sum, and their sum at the knots alone.
+        The further results are the multipliers, the sum of all remaining violations, and the sum of
+        the violations at the knots.
         """
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
@@ -179,9 +182,9 @@ class Search(NamedTuple):
         return *found, at_knots + float(excess(rows.limits - rows.values(z, du)).sum()), at_knots
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
-        """Close the gaps between intervals by the smallest changes, if possible.
+        """Close the gaps between intervals with the smallest changes, if possible.
 
-        `left` contains the violations at the knots that the earlier quadratic programs left.
+        `left` contains the violations at the knots that remained after earlier quadratic programs.
         """
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
@@ -195,8 +198,8 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # If all intervals integrated as one motion do not at least halve the violation,
-                # errors grow too much along this motion. The trial before it is then returned.
+                # If the motion integrated as one does not halve the violation, errors grow too
+                # fast along it. The trial with separate intervals is then returned.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
@@ -209,19 +212,22 @@ class Search(NamedTuple):
         return trial if trial.gap <= _MEETS else self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
-        """Return the motion from the start under the inputs, as a trial without gaps."""
+        """Integrate the motion from the start under the inputs, and return it as a trial."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
 
 
 def _stagnates(left: list[float]) -> bool:
-    """Return whether large violations did not fall by a tenth in _STAGNANT iterations."""
+    """Return whether violations are large and did not fall by a tenth in _STAGNANT iterations."""
     before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
     return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
 
 def excess(room: Array) -> Array:
-    """Return by how much points exceed limits; `room` is how far they may move down and up."""
+    """Return by how much points exceed limits.
+
+    `room` (2, ..) contains the lower and upper limits minus the values at the points.
+    """
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)
 
 
@@ -230,7 +236,10 @@ _ACCURACY = 1e-10
 
 
 class StageRows(NamedTuple):
-    """Soft limits low - s <= G (x[k], u[k], u[k + 1]) <= high + s of linear combinations."""
+    """Soft limits on linear combinations of states and inputs.
+
+    The limits are ``low - s <= G (x[k], u[k], u[k + 1]) <= high + s`` with a slack ``s >= 0``.
+    """
 
     k: Indices  # (m,)
     G: Array  # (m, nx + 2 nu)
@@ -254,20 +263,21 @@ def solve_stages(
     rows: StageRows,
     scale: Array,
 ) -> tuple[Array, Array, Array] | None:
-    r"""Solve a quadratic program in w = (x, u) over N stages, with bounds on every variable.
+    r"""Solve a quadratic program over N stages for w = (x, u), with bounds on every variable.
 
     .. math::
         \min \sum_{k=0}^N \tfrac12 w_k^T H_k w_k + g_k^T w_k + \mathrm{soft}_k^T s_k, \quad
         x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad x_0 = 0, \quad
         \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0
 
-    The soft limits of `rows` are further constraints. The program is scaled by typical sizes
-    `scale` (nx + nu,) of the variables. `ends` (N, nx, nx + 2 nu) contains A, B and D side by side;
-    D is zero if inputs are held. `H` (N + 1, nx + nu, nx + nu) is positive semidefinite. `limits`
-    (2, N + 1, nx + nu) are low and high, and g and soft have one row for each knot.
+    The soft limits of `rows` are further constraints. `scale` (nx + nu,) contains typical sizes of
+    the variables, by which the program is scaled. `ends` (N, nx, nx + 2 nu) contains A, B and D
+    side by side; D is zero if inputs are held. `H` (N + 1, nx + nu, nx + nu) is positive
+    semidefinite. `limits` (2, N + 1, nx + nu) contains low and high. g and soft have one row for
+    each knot; a bound with an infinite entry of soft is hard.
 
-    Returns x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints, or
-    None if the program is infeasible or the solver fails.
+    Returns x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
+    Returns None if the program is infeasible or the solver fails.
     """
     import scipy.sparse as sp
 
@@ -295,7 +305,7 @@ def solve_stages(
         ),
         (len(columns), knots * nw),
     )
-    # Each soft limit has a slack s: w + s >= low, w - s <= high.
+    # Each soft limit has a slack s, with w + s >= low and w - s <= high.
     limited = sp.vstack((picked, combined))
     least, largest = np.hstack(((low[at], high[at]), rows.limits))
     prices = np.concatenate((prices[at], np.full(len(columns), rows.soft)))

@@ -14,26 +14,26 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution whose residual is below this is exact up to rounding error.
+# A solution whose relative residual is at most this is accepted, and no other method is tried.
 _SOUND = 1e-11
 _STEPS = 25
 
-# A residual below _ROUNDED is rounding error if a step does not reduce it. Below _NEAR, every
-# Newton step reduces the residual.
+# A residual below _ROUNDED is rounding error if a Newton step does not halve it. If the residual is
+# below _NEAR, a Newton step is accepted only if it reduces the residual.
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
 _APART = 1e-5
 
 # A pole is near the stability boundary if its distance from the boundary, relative to the largest
-# pole, is below this. Rounding moves the pole of a mode that Q does not weight by such a distance.
+# pole, is below this. Rounding errors move a pole by such a distance if Q does not weight its mode.
 _NEAR_BOUNDARY = 1e-6
 
 
 class Solution(NamedTuple):
-    """Solution of a Riccati equation: P, K, the sorted poles of A - B K, residual and method.
+    """Solution P of a Riccati equation, with its gain K, residual and method.
 
-    The margin is the distance of the poles from the stability boundary.
+    `poles` are the sorted poles of A - B K. `margin` is their distance from the stability boundary.
     """
 
     P: Array
@@ -54,7 +54,7 @@ def solved(
 
 
 def rates_of(poles: Values, dt: float) -> Values:
-    """Return poles of a model with sample time dt [s], or 0, as continuous-time rates [1/s]."""
+    """Convert poles to continuous-time rates [1/s]; dt [s] is 0 if the poles are continuous."""
     return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
 
 
@@ -65,12 +65,16 @@ class _Trial(NamedTuple):
 
 
 class Riccati:
-    """Equation A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0, or its sampled form if dt > 0."""
+    """Algebraic Riccati equation, in its sampled form if dt > 0.
+
+    In continuous time, it is ``A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0``.
+    """
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # For a sampled system, use A - I, because P - A' P A would lose accuracy by cancellation.
+        # For a sampled system, A - I is used, because A' P A - P would lose accuracy by
+        # cancellation.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -84,7 +88,7 @@ class Riccati:
         return dtrtrs(factor, Y, lower=1, trans=1)[0]
 
     def trial(self, P: Array) -> _Trial:
-        """Return P, its defect, and the defect relative to the sum of the norms of the terms."""
+        """Return P, its residual matrix (`defect`), and the relative norm of this matrix."""
         _, Y = self._factored(P)
         change = P @ self.rate
         spent = Y.T @ Y
@@ -100,7 +104,10 @@ class Riccati:
         return _Trial(P, defect, residual)
 
     def _factored(self, P: Array) -> tuple[Array, Array]:
-        """Return L and Y with W = L L', where K = L^-T Y and Y' Y is the cost of the gain."""
+        """Return the Cholesky factor L of W, and Y = L' K with the gain K.
+
+        W is R in continuous time, and R + B' P B for a sampled system.
+        """
         if not self.discrete:
             Y = self._inputs @ P
             return self.R_factor, Y if self.cross is None else Y + self.cross
@@ -116,10 +123,10 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Return the stabilising solution, by the half-size method or SciPy, or raise `LinAlgError`.
+    """Return the stabilising solution of the half-size method, or of SciPy if this is inaccurate.
 
-    Newton's method refines the solution (D. L. Kleinman, IEEE Trans. Automatic Control 13(1),
-    1968).
+    Raise `LinAlgError` if both fail. Newton's method refines the solution (D. L. Kleinman, IEEE
+    Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -127,7 +134,7 @@ def solve(
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
-        # SciPy raises either of these errors if it cannot reorder a pencil.
+        # SciPy raises one of these errors if it cannot reorder the eigenvalues of the pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
@@ -142,9 +149,9 @@ def solve(
 def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
-    """Return the solution of the half-size method, or None if it is not certain.
+    """Return the solution of the half-size method, or None if it is not reliable.
 
-    The solution is not certain if it is inaccurate, or if a pole is near the stability boundary.
+    The solution is not reliable if it is inaccurate, or if a pole is near the stability boundary.
     """
     found = _half_size(Riccati(A, B, Q, R, N, dt))
     if found is None or found.residual > _SOUND:
@@ -154,7 +161,7 @@ def half_size(
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve by the modes of a loop in which velocities are scaled by 1 + `apart`."""
+    """Solve by the half-size method, with rows and columns of Q for rates scaled by 1 + `apart`."""
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -162,7 +169,7 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         A, Q, cross = source.A, source.Q, source.cross
         if cross is not None:
-            # With u + R^-1 N' x as input, the cost has no cross term.
+            # The substitution u + R^-1 N' x for the input removes the cross term from the cost.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
         scale = np.ones(len(A))
@@ -177,21 +184,21 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
         found = _finished(equation, *refined, "structured")
     if apart or (found is not None and found.residual <= _SOUND):
         return found
-    # If modes coincide, as in critical damping, V is singular. Newton's method then starts from a
-    # slightly different loop.
+    # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
+    # method then starts from a slightly different loop.
     return _half_size(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation that has the solution P of a sampled one (10.6)."""
+    """Return the continuous equation with the same P as a sampled equation (10.6), or None."""
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # Rows that should be zero contain rounding errors, so they are set to zero. Newton's method
-    # uses the original equation.
+    # Rows of Bc that should be zero contain rounding errors, so they are set to zero. Newton's
+    # method corrects the effect, because it uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -211,7 +218,7 @@ def _finished(
 def _refined(
     equation: Riccati, P: Array, modes: ModalMatrix | None
 ) -> tuple[_Trial, ModalMatrix | None]:
-    """Refine P by Newton steps; `modes`, if given, belong to a loop near the loop of P."""
+    """Refine P by Newton steps; `modes` are None, or belong to a loop near the loop of P."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False
@@ -223,7 +230,7 @@ def _refined(
             modes, fresh = ModalMatrix.of(F, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # Far from the solution, the first step may raise the residual and still improve P, so it is
+        # Far from the solution, a Newton step may improve P although the residual rises, so it is
         # accepted.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
@@ -233,8 +240,8 @@ def _refined(
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # Progress is slow if the modes belong to a closed loop that differs too much from the
-            # closed loop of the current P. New modes are then computed.
+            # Progress is slow if the modes belong to a loop that differs too much from the loop of
+            # the current P. New modes are then computed.
             if fresh and trial is not better:
                 break
             modes = None
@@ -242,7 +249,10 @@ def _refined(
 
 
 def _general(equation: Riccati, unit: bool) -> Array:
-    """Solve by SciPy; `unit` scales R to I, because SciPy takes a badly scaled R for singular."""
+    """Solve with SciPy.
+
+    `unit` scales the inputs so that R is I, because SciPy treats a badly scaled R as singular.
+    """
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are
@@ -282,17 +292,17 @@ class ModalMatrix:
 
     def lyapunov_modal(self, r: Values) -> Array:
         """Solve the equation of `lyapunov`, with r given as V^H r V."""
-        # In modal coordinates, the equation is solved by an elementwise division.
+        # In modal coordinates, the factors solve the equation element by element.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 
     def poles(self, F: Array) -> Values:
-        """Return the eigenvalues of F, which are diagonal entries if the modes V decouple F."""
+        """Return the eigenvalues of F; if the modes V decouple F, avoid an eigenproblem."""
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
         M.flat[:: len(M) + 1] = 0.0
-        # A relative perturbation X of a normal matrix changes its eigenvalues by at most the norm
-        # of X, relative to their magnitude.
+        # If a diagonal matrix is multiplied by I + X, the relative change of its eigenvalues is at
+        # most the norm of X.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
         real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
@@ -304,17 +314,18 @@ class ModalMatrix:
 def second_order_loop(
     A: Array, B: Array, Q: Array, R_factor: Array
 ) -> tuple[ModalMatrix, Values] | None:
-    """Return a loop that is optimal if odd powers (10.5) are neglected, or None if impossible.
+    """Return a loop that is optimal if odd powers are neglected (10.5).
 
-    The loop is described by its modes V and the cost V^H (Q + K' R K) V of its gain.
+    The results are the modes V of the loop, and the cost V^H (Q + K' R K) V of its gain K. Return
+    None if there is no such loop, for example because the model is not of second order.
     """
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # The inverse weight on forces is S = Ls Ls'. S is not computed, because this would square the
-    # condition number.
+    # The effect B R^-1 B' of the inputs on the velocities is Ls Ls'. The product is not computed,
+    # because this would square the condition number.
     triangle = np.asarray(np.linalg.qr(white, mode="r"))
     Ls = triangle.T
     sizes = np.abs(Ls.diagonal())
@@ -346,7 +357,8 @@ def second_order_loop(
     if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
     poles = -np.sqrt(squares)
-    # The lower half of w is the acceleration a = mu p.
+    # The lower half of each eigenvector is the acceleration a of a mode: a = `squares` times the
+    # position.
     a = W[m:]
     motion = np.concatenate((a / squares, a / poles))
     if not plain:

@@ -1,4 +1,4 @@
-"""Multiple shooting: the initial guess, the gaps between intervals, and their Jacobians."""
+"""Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Least number of steps per interval in a trial, because limits also apply between the steps.
+# Least number of steps per interval in a trial, because limits also apply within the intervals.
 _STEPS = 16
 
 # Jacobians are integrated with a quarter of the steps of the motion, but with at most this number.
@@ -27,7 +27,7 @@ Point = tuple[Array, Array]
 
 
 class Motions(NamedTuple):
-    """Motions of N intervals from the knots, with a row at the end of each step."""
+    """Motions of N intervals from the knots, with a row for the start and for each step."""
 
     q: Array  # (N, steps + 1, nq)
     v: Array  # (N, steps + 1, nv)
@@ -35,24 +35,27 @@ class Motions(NamedTuple):
 
 
 class Shooting:
-    """Multiple shooting from equally spaced knots at times t (N + 1,), the starts of N motions."""
+    """Multiple shooting with N motions, which start at equally spaced knots.
 
-    # A step from one point to another is z = (theta_b, r_b, q_m, nu) (nx,) in base axes. It has
-    # the states of the linear models, but the rotation vector theta_b replaces 2 q_b.
+    t (N + 1,) contains the times of the knots and of the end.
+    """
+
+    # A step z (nx,) from one point to another has the order of the states of the linear models, in
+    # base axes. The rotation vector of the base replaces 2 q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
-        # The engine is fixed, so that a plan is the same bit for bit regardless of earlier
-        # computations.
+        # The engine of the linearisation is fixed, so that earlier computations do not change any
+        # bit of a plan.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
-        """Return the step z (nx,) from one point to another, in which wheel angles are zero."""
+        """Return the step z (nx,) between two points, with zero change of the wheel angles."""
         state = self.state
         difference = pin.difference(state.robot.model, start[0], end[0])
         z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
@@ -92,7 +95,7 @@ class Shooting:
         return np.array([self.between(row[:2], row[2:]) for row in rows])
 
     def flown(self, start: Point, u: Array) -> Point:
-        """Return the knots of the motion from a point under inputs."""
+        """Integrate the motion from a point under the inputs u, and return its knots."""
         q, v = (np.tile(each, (len(u), 1)) for each in start)
         for k in range(len(u) - 1):
             found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
@@ -100,7 +103,10 @@ class Shooting:
         return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
-        """Return the limited values (.., nx): positions and rates of joints, zero for the base."""
+        """Return the values (.., nx) of states with limits: joint positions and rates.
+
+        The values of the base are zero.
+        """
         state = self.state
         n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
         values[..., 6 : 6 + n] = state.joint_positions(q)
@@ -108,8 +114,8 @@ class Shooting:
         return values
 
     def inside(self, motions: Motions, parts: int) -> Array:
-        """Return the limited values (N, parts - 1, nx) between equal parts of the intervals."""
-        # Between the ends of steps, rates are Hermite cubics and positions are their integrals.
+        """Return limited values (N, parts - 1, nx) where each interval is divided into parts."""
+        # Within a step, the rates are Hermite cubics of time. The positions are their integrals.
         n, steps = self.state.robot.n, motions.q.shape[1] - 1
         at = np.arange(1, parts) * steps / parts
         step = at.astype(int)
@@ -124,7 +130,7 @@ class Shooting:
         return values
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Increase the number of steps until interval ends have this accuracy [rad, m, s]."""
+        """Find the number of steps for which interval ends have this accuracy [rad, m, s]."""
         self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
@@ -134,13 +140,13 @@ class Shooting:
                 break
 
     def jacobians(self, q: Array, v: Array, u: Array, parts: int = 1) -> tuple[Array, Array]:
-        """Return Jacobians of interval ends with respect to z and the inputs at both knots.
+        """Return Jacobians of interval ends, and of points within the intervals.
 
-        The first array (N, nx, nx + 2 nu) contains the Jacobians side by side. The second array
-        (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of the points between the equal parts
-        of the intervals.
+        The first array (N, nx, nx + 2 nu) contains the Jacobians of the ends. Its columns belong to
+        z at the start, and to the inputs at both knots. The second array (N, parts - 1, nx,
+        nx + 2 nu) contains the Jacobians where each interval is divided into equal parts.
         """
-        # Runge-Kutta steps of dZ/dt = A Z + B along the motions, for all intervals at once.
+        # Runge-Kutta steps of dZ/dt = A Z + B along the motions; one array holds all intervals.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
@@ -172,7 +178,7 @@ class Shooting:
         return Z, np.concatenate(inside, axis=1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
-        """Return knots on cubics between two points, and approximate inputs for them."""
+        """Return knots on cubic curves between two points, and approximate inputs for them."""
         model, T = self.state.robot.model, self.t[-1]
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
@@ -184,8 +190,8 @@ class Shooting:
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
         difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
-        # The final rate of the rotation vector is a least-squares solution, because its Jacobian is
-        # singular after full rotations about the axis.
+        # The final rate of the rotation vector is a least-squares solution, because the Jacobian of
+        # the rotation vector is singular after full rotations about the axis.
         jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
         late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference
