@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
 
 
 def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
-    """Return the fraction of successes and its Clopper-Pearson interval, exact for any count."""
+    """Return the fraction of successes, and its exact confidence interval (Clopper-Pearson)."""
     from scipy.special import betaincinv
 
     tail, failures = (1.0 - confidence) / 2.0, count - successes

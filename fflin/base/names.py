@@ -18,7 +18,7 @@ def group_of(name: str) -> str:
 
 
 def input_keys(of: Any) -> tuple[str, ...]:
-    """Return GROUP.ENTRY for each input of an object with `input_names` and `input_units`."""
+    """Return the name GROUP.ENTRY of each input; `of` has `input_names` and `input_units`."""
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)

@@ -1,4 +1,4 @@
-"""Settings of this process: its progress bar on stderr, its import path, its BLAS threads."""
+"""Progress bar on stderr, checks of the import path, and a limit on the threads of BLAS."""
 
 import os
 import sys
@@ -28,7 +28,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated duration of a long computation before it starts."""
+        """Print the estimated duration of a computation before it starts, unless below 10 s."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")

@@ -58,7 +58,7 @@ _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
-    """Write a record in the format that the path's ending selects; add a digest if asked."""
+    """Write a record in the format of the path's ending, with a digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
     write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
@@ -276,7 +276,7 @@ class Design(Result):
 
     @classmethod
     def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
-        """Return a result with the fields `own`; the first source with a field gives its value."""
+        """Return a result with the fields `own`; others come from the first source with them."""
         names = [each.name for each in fields(cls) if each.init]
         for source in sources:
             own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own

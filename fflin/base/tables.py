@@ -110,7 +110,7 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Estimate the rounding error of each entry from the largest entries of its row and column."""
+    """Return eps times the largest entry of each entry's row or column, whichever is smaller."""
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
     return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))

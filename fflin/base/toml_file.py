@@ -84,7 +84,7 @@ class TomlFile:
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Add file, line and the prefix `of` to an error; the line is of the key that it names."""
+        """Begin an error with the file, the line of the key that it names, and the prefix `of`."""
         try:
             yield
         except FflinError as error:

@@ -176,7 +176,7 @@ def check_output_path(target: Path) -> None:
 
 
 def check_distinct(*targets: Path | None) -> None:
-    """Raise `FileError` if two outputs are the same file after links are followed; skip None."""
+    """Raise `FileError` if two paths of outputs lead to the same file; ignore None."""
     seen: list[Path] = []
     for target in filter(None, targets):
         for first in seen:

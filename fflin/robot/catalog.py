@@ -92,7 +92,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by the name of a bundled robot, or otherwise by the file's path."""
+    """Find a file of inputs by its bundled name, or otherwise by its path."""
     path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     if str(inputs) in bundled:
@@ -103,7 +103,7 @@ def find_inputs(inputs: str | Path) -> Path:
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
-    """Return one folder or a list of folders as paths; relative paths begin at `within`."""
+    """Return one folder or a list of folders as paths, which are relative to `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):
         raise InputError(f"package_dirs is {given!r}, expected a list of folders")

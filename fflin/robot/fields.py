@@ -264,7 +264,7 @@ def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:
-    """Return {input or state: magnitude} of all finite limits.
+    """Return {input or state: magnitude} for all limits whose magnitude is finite and not zero.
 
     For a joint position, the magnitude is the range from the lower to the upper limit. The same
     holds if the lower limit is not negative. Otherwise, it is the smaller of both magnitudes.

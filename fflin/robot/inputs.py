@@ -59,7 +59,7 @@ class Input:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Names of the model's frames in which this input is fixed."""
+        """Names of the model's frames on which this input is mounted."""
         frame: str | None = getattr(self, "frame", None)
         return () if frame is None else (frame,)
 

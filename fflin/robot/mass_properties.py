@@ -154,7 +154,7 @@ def properties(P: Array) -> tuple[Array, Array, Array]:
 
 
 class LinkMass(NamedTuple):
-    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the origin of `placement`."""
+    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the centre of mass."""
 
     mass: float
     inertia: Array
@@ -162,7 +162,7 @@ class LinkMass(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Mass properties of a link, or of a whole body, on the joint that moves it."""
+    """Mass properties of a link or of a whole body, and the joint that moves it."""
 
     joint: int
     placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
@@ -253,7 +253,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         for body, (values, _) in zip(bodies, moments, strict=True)
     ):
         return ()
-    # The independent rates nu determine v = columns @ nu, because mimic joints follow their leaders.
+    # The independent rates nu determine v = columns @ nu, since mimic joints follow their leaders.
     columns = np.eye(robot.nv)
     for joint, leader, multiplier, _ in robot.followers:
         columns[joint.idx_v, leader.idx_v] = multiplier
@@ -314,7 +314,8 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
 def rotor_names(robot: Robot) -> tuple[str, ...]:
     """Return the names of rotors: joints of a body that is symmetric about the joint axis.
 
-    A rotor carries or leads no other joint, has no spring, and carries no frame of an input or output.
+    A rotor carries and leads no other joint, and has no spring. It carries no frame of an input or
+    an output.
     """
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}

@@ -75,7 +75,7 @@ class BasePose(Output):
 
 @dataclass(frozen=True)
 class JointOutput(Output):
-    """Base class of outputs of joints, by default of all joints."""
+    """Base class of outputs of chosen joints, or by default of all joints."""
 
     joints: tuple[str, ...] | None = None
 

@@ -127,7 +127,7 @@ def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict
 
 
 def with_appendages(robot: Robot, appendages: object) -> Robot:
-    """Return a robot with other flexible appendages and slosh, whose modes are joints."""
+    """Return a robot with other appendages (flexible or slosh), whose modes become joints."""
     given = [appendages] if isinstance(appendages, Appendage) else appendages
     if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
         raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
@@ -159,7 +159,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 
 
 class Mounted(NamedTuple):
-    """A mounted body, and the joint on which it moves relative to its carrier.
+    """Body that is mounted on another body, its carrier, and the joint between the two.
 
     `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
     is the joint's placement in the carrier's frame. `inertia` is the body's inertia in the joint's
@@ -297,7 +297,7 @@ def turned_to(axis: Array) -> Array:
 
 
 def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
-    """Return the joint that carries an appendage, its placement and its participation L (6, k).
+    """Return an appendage's carrying joint, its placement and its participation L (6, k).
 
     The placement and L are in the frame of the carrying body. L is about the body's origin.
     """

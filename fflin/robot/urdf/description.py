@@ -71,7 +71,7 @@ class Pose(NamedTuple):
 
 
 class Link(NamedTuple):
-    """One link, and the element that describes it."""
+    """Link of a URDF, and its XML element."""
 
     name: str
     element: Element
@@ -95,7 +95,7 @@ class Mimic(NamedTuple):
 
 
 class JointElement(NamedTuple):
-    """One joint between two links, and the element that describes it."""
+    """Joint of a URDF between two links, and its XML element."""
 
     name: str
     element: Element

@@ -65,7 +65,7 @@ class Element:
         return UrdfError(f"{self.origin}:{self.line}: {message}")
 
     def note(self, message: str) -> None:
-        """Add a warning about this element; equal warnings appear once, with all line numbers."""
+        """Add a warning about this element; a repeated warning appears once, with a count."""
         self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
@@ -115,7 +115,7 @@ class Element:
                 )
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
-        """Yield all elements below this element in document order, except skipped subtrees."""
+        """Yield all elements below this element in document order, except the subtrees `skip`."""
         for child in self.children:
             if child.tag not in skip:
                 yield child
