@@ -258,7 +258,7 @@ class Design(Result):
     verified: bool = field(default=True, kw_only=True)
 
     def __init_subclass__(cls) -> None:
-        # `_value` compares the annotations of fields with text, so they must be text.
+        # `_value` reads the type of a field from its annotation, which must therefore be text.
         if not all(isinstance(kind, str) for kind in vars(cls).get("__annotations__", {}).values()):
             raise TypeError(f"'{cls.__name__}' needs `from __future__ import annotations`")
 

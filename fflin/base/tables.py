@@ -110,7 +110,10 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Return eps times the largest entry of each entry's row or column, whichever is smaller."""
+    """Estimate rounding errors as eps times the largest entry of the row or column.
+
+    The smaller of the two estimates applies to each entry.
+    """
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
     return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))

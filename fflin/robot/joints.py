@@ -241,7 +241,7 @@ class Coordinates:
         return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:
-        """Return a copy of q (nq,) in which mimic joints follow; refuse errors above 1e-6."""
+        """Return a copy of q (nq,) with mimic joints corrected; refuse errors above 1e-6."""
         placed = q.copy()
         self.follow(placed)
         for joint, leader, *_ in self.followers:

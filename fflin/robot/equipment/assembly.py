@@ -67,7 +67,7 @@ def equipped(
     inputs: object = None,
     appendages: Sequence[Appendage] | None = None,
 ) -> Robot:
-    """Return a robot with other inputs or appendages, or based on another robot `bare`.
+    """Return a robot with other inputs, other appendages, or another robot without equipment.
 
     `bare` is the robot without wheels and modes. Arguments that are not given keep their values.
     Modes become joints, and wheels that have an inertia do too. Entries of joints that no longer
@@ -103,7 +103,7 @@ def equipped(
         fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
         for item in items:
             fields[name] |= item.springs[name]
-    # Only wheels and modes are named here. Joints of `before` that are gone have been locked.
+    # Remember only the names of wheels and modes. Other joints that are gone have been locked.
     removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
     return replace(
         robot,
@@ -159,7 +159,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 
 
 class Mounted(NamedTuple):
-    """Body that is mounted on another body, its carrier, and the joint between the two.
+    """Body that is mounted on a carrier, and the joint between body and carrier.
 
     `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
     is the joint's placement in the carrier's frame. `inertia` is the body's inertia in the joint's
@@ -297,7 +297,7 @@ def turned_to(axis: Array) -> Array:
 
 
 def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
-    """Return an appendage's carrying joint, its placement and its participation L (6, k).
+    """Return an appendage's carrying joint, placement and participation L (6, k).
 
     The placement and L are in the frame of the carrying body. L is about the body's origin.
     """
