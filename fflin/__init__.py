@@ -4,7 +4,7 @@ from importlib import import_module
 
 from fflin.base import __version__
 
-# Public names by task, with their modules. A name is imported when it is first used (PEP 562), so
+# Public names, as {task: {module: names}}. Each name is imported at its first use (PEP 562), so
 # that a command without dynamics does not load Pinocchio. Type checkers read `__init__.pyi`, which
 # lists the same names and modules.
 _PUBLIC = {
@@ -120,7 +120,7 @@ def __getattr__(name: str) -> object:
 
 
 def _untyped(function: object) -> None:
-    """Remove the types from the signature that help shows; the docstring describes them."""
+    """Remove type annotations from the signature that `help` shows; the docstring gives types."""
     from inspect import Parameter, signature
 
     shown = signature(function)

@@ -1,4 +1,4 @@
-"""Run the command line, as ``fflin`` and as ``python -m fflin``."""
+"""Entry point of the command line, for ``fflin`` and for ``python -m fflin``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Run the command line on the arguments of this process, and return its exit code."""
+    """Run the command that the arguments of this process give, and return its exit code."""
     # `python -m fflin` puts the working folder first on the import path. It is removed before
     # further imports, unless fflin itself is imported from there.
     if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
@@ -46,10 +46,10 @@ def listen() -> None:
 
 
 def leave(reason: BaseException) -> NoReturn:
-    """Report the stop in one line, and exit without waiting for threads."""
+    """Report in one line that the command was stopped; exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        # The line is written at once, so that the output of other processes cannot split it.
+        # The line is written in one call, so that the output of other processes cannot split it.
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()

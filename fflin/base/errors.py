@@ -11,7 +11,7 @@ from types import ModuleType
 # largest length of a message.
 _CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
-# Line break before an indented line, found in messages of other packages.
+# Matches a line break before an indented line. Messages of other packages contain such breaks.
 _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 
 
@@ -24,7 +24,7 @@ def one_line(text: str) -> str:
 
 
 def _cut(text: str, size: int) -> str:
-    """Return both ends of a text, about `size` characters in all."""
+    """Shorten a text to its two ends, with about `size` characters in all."""
     return f"{text[: 2 * size // 3]}...{text[-size // 3 :]}"
 
 
@@ -249,7 +249,7 @@ class FflinWarning(UserWarning):
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Begin the message of an error with the place where it occurs."""
+    """Put the place `where` before the message of every fflin error that is raised inside."""
     try:
         yield
     except FflinError as error:
@@ -257,13 +257,13 @@ def located(where: str) -> Iterator[None]:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Join names for a sentence: the first six different names and the number of the others."""
+    """Join names for a sentence: give the first six distinct names, and count the others."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Build the error for an unknown name, with similar names as a hint."""
+    """Build the error for an unknown name; its hint lists similar names, or the known names."""
     import difflib
 
     names = list(known)

@@ -41,7 +41,7 @@ def letters_of(count: float, height: float) -> float:
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Make an axis symmetric logarithmic if the sizes of its values span a decade."""
+    """Give an axis a symmetric logarithmic scale if its nonzero magnitudes span a decade."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return
@@ -56,7 +56,7 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 def drawing(
     path: str | Path | None, width: float, height: float, compressed: bool = False
 ) -> Iterator[Figure]:
-    """Yield a figure of a size [in] in fflin's style; save the figure if a path is given."""
+    """Yield a figure of `width` x `height` [in] in fflin's style; save it if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:
         check_ending(target, FORMATS)

@@ -1,4 +1,4 @@
-"""Confidence intervals of a fraction, a quantile and a mean, and rank correlation.
+"""Confidence intervals of fractions, quantiles and means; rank correlations.
 
 C. J. Clopper and E. S. Pearson, Biometrika 26(4), 1934; H. A. David and H. N. Nagaraja, Order
 Statistics, 3rd edition, 2003, section 7.1.
@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
 
 
 def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
-    """Return the fraction of successes and its Clopper-Pearson interval, exact for any count."""
+    """Return the fraction of successes, and its exact confidence interval (Clopper-Pearson)."""
     from scipy.special import betaincinv
 
     tail, failures = (1.0 - confidence) / 2.0, count - successes
@@ -31,10 +31,11 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of runs (N,), which are sorted by the distance of their start.
+    """Return success statistics of N runs, sorted by increasing distance of their start.
 
-    The statistics are the number of runs before the first failure, a lower bound on the success
-    rate of these starts, and a confidence interval for the success rate of all runs.
+    `failed` (N,) is true for each failed run. The statistics are the number of runs before the
+    first failure, a lower bound on the success rate up to this distance, and a confidence interval
+    for the success rate of all runs.
     """
     count = len(failed)
     inside = int(failed.argmax()) if failed.any() else count
@@ -44,7 +45,7 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile and its interval; an end is infinite if there are too few draws."""
+    """Return the p-quantile and its interval; an end is infinite if there are too few values."""
     from scipy.special import bdtr
 
     count = len(values)
@@ -69,10 +70,10 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of each column (N, k) with values (N,), also infinite ones."""
+    """Return Spearman's correlation of each column (N, k) with values (N,), which may be inf."""
     ranks = np.empty((len(values), columns.shape[1] + 1))
     for k, column in enumerate((*columns.T, values)):
-        # Equal values share the mean of their ranks.
+        # Equal values all get the mean of their ranks.
         _, which, counts = np.unique(column, return_inverse=True, return_counts=True)
         ranks[:, k] = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
     ranks -= ranks.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Names GROUP.ENTRY of states and inputs, and patterns that match them."""
+"""Names of states and inputs in the form GROUP.ENTRY, and patterns that match these names."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,7 @@ def group_of(name: str) -> str:
 
 
 def input_keys(of: Any) -> tuple[str, ...]:
-    """Return GROUP.ENTRY for each input of an object with `input_names` and `input_units`."""
+    """Return the name GROUP.ENTRY of each input; `of` has `input_names` and `input_units`."""
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)
@@ -26,7 +26,7 @@ def input_keys(of: Any) -> tuple[str, ...]:
 
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the 12 + 2n states: the configuration, followed by its rates."""
+    """Return the names of the 12 + 2n states: first the configuration, then the velocity."""
     return (
         *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
         *(f"q_m.{name}" for name in joints),
@@ -36,7 +36,10 @@ def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:
-    """Return (first, last, group, units) of consecutive names with the same group or unit."""
+    """Return (first, last, group, units) for each run of consecutive names of one group.
+
+    Names without a group form a run if they have the same unit.
+    """
     found: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
@@ -49,11 +52,14 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
-    """Return the indices of the names that match a key: ``tau_m.x``, ``tau_m``, ``x`` or ``*x``."""
+    """Return the indices of the names that match a key, such as ``tau_m.x``, ``tau_m`` or ``*x``.
+
+    The key is a name, a group, the entry of a name, or a pattern.
+    """
     if key in names:
         return [names.index(key)]
-    # The pattern must match a name or its entry. Only * and ? are wildcards, because brackets may
-    # occur in joint names.
+    # The pattern must match a whole name, or else the part after its first dot. Only * and ? are
+    # wildcards, because joint names may contain brackets.
     pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
@@ -81,7 +87,7 @@ def stands_for_any(key: str, names: Sequence[str]) -> bool:
 
 
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
-    """Return {index: value} of {key: value}; names override groups, groups override patterns."""
+    """Return {index of a name: value}; names override patterns, which override groups."""
     found: dict[int, T] = {}
     groups = {*map(group_of, names)}
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
@@ -90,7 +96,7 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
 
 
 def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
-    """Return {state: rate} from the rates of joints, states, groups or patterns."""
+    """Return {velocity state: rate}; the keys of `values` are joints, states, groups, patterns."""
     names = state_keys(joints)[6 + len(joints) :]
     full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
     return {names[index]: value for index, value in by_name("velocity", full, names).items()}
@@ -104,7 +110,7 @@ def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
 def joints_by_name(
     kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], object]
 ) -> dict[str, T]:
-    """Return {joint: value} from values of joints, patterns or groups; `find` checks one name."""
+    """Return {joint: value} from {joint, pattern or ``q_m``: value}; `find` checks one name."""
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
     states = [f"q_m.{name}" for name in joints]
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}

@@ -1,4 +1,4 @@
-"""Progress bar on stderr, folders of the import path, and threads of BLAS."""
+"""Progress bar on stderr, checks of the import path, and a limit on the threads of BLAS."""
 
 import os
 import sys
@@ -17,7 +17,7 @@ LONG_RUN = 20.0  # seconds of a run after which a faster engine is recommended
 
 
 class Progress:
-    """Progress bar; by default, it appears on a terminal if the run takes long."""
+    """Progress bar; by default, it appears only on a terminal, and only after one second."""
 
     def __init__(self, shown: bool | None = None) -> None:
         terminal = sys.stderr is not None and sys.stderr.isatty()
@@ -28,7 +28,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated duration of a long computation before it starts."""
+        """Print the estimated duration of a computation before it starts, unless below 10 s."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
@@ -37,7 +37,10 @@ class Progress:
         print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
-        """Update the bar: `done` of `total` steps of `what`; a long run also shows `hint`."""
+        """Show that `done` of `total` steps are done, after the label `what`.
+
+        A run of more than 20 s also shows `hint`.
+        """
         self.done, self.total = done, total
         if self._shown:
             share = done / total
@@ -47,7 +50,7 @@ class Progress:
             self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
     def say(self, text: str) -> None:
-        """Show a line instead of the bar, for work of unknown length."""
+        """Show a line of text in the bar's place, for example for work of unknown length."""
         if self._shown and (now := time.monotonic()) >= self._next:
             self._next, self._drawn = now + _INTERVAL, True
             print(f"\r\x1b[2K{text}", end="", file=sys.stderr, flush=True)
@@ -59,12 +62,12 @@ class Progress:
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
-    """Return `sys.path` without the entries that refer to some folders, however they are spelt."""
+    """Return `sys.path` without the entries that refer to given folders, in any spelling."""
     return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
 
 
 def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:
-    """Return whether two paths are the same file or folder; an empty path is the working folder."""
+    """Return whether two paths lead to one file or folder; "" means the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
     except (OSError, ValueError):  # one of them does not exist

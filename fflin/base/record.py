@@ -1,4 +1,4 @@
-"""Records on disk: named arrays, strings, lists of strings, numbers and groups of numbers.
+"""Records on disk, which consist of named arrays, strings, lists of strings, and numbers.
 
 Models, gains, schedules, filters and motions are saved as records. Any program that reads .npz,
 .mat or .json can read them. Each file contains a SHA-256 digest, so that a damaged or edited file
@@ -53,27 +53,28 @@ _BLOCK = 2**22
 _LARGEST = 1e300
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
-# Remains of a damaged header with a digest.
+# Matches what is left of a header with a digest after the header was damaged.
 _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
-    """Write a record in the format of the file's ending, with its digest if `checksummed`."""
+    """Write a record in the format of the path's ending, with a digest if `checksummed`."""
     check_ending(path, FORMATS)
     require_finite(record)
     write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Return the record in a file, and whether its digest was verified; call within `reading`."""
-    # The shape of an array may change, because .mat has no vectors and .json has no empty matrices.
+    """Read a file within `reading`; return its record, and whether its digest was verified."""
+    # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
+    # has no empty matrices.
     check_ending(path, FORMATS)
     return CODECS[path.suffix][1](read_file(path, path.suffix))
 
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Convert any error in reading a file to one `FileError`."""
+    """Convert errors that occur inside, while a file is read, to `FileError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
@@ -112,7 +113,7 @@ def figure(value: object) -> float:
 
 
 def figures(value: object) -> dict[str, float]:
-    """Return a group of numbers from a record."""
+    """Return a group of numbers {name: number} from a record."""
     group = value if isinstance(value, dict) else json.loads(text(value))
     return {key: figure(x) for key, x in group.items()}
 
@@ -150,8 +151,8 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with its number of entries. This number reveals entries that a damaged length
-    # field hides.
+    # The archive ends with the number of its entries. If a damaged length field hides some of them,
+    # fewer entries are read.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -159,7 +160,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
 
 
 def verify_checksum(record: Record) -> bool:
-    """Remove and verify the digest of .npz entries; return False if there is no digest."""
+    """Remove the digest from .npz entries and verify it; return False if there is no digest."""
     checksum = record.pop(CHECKSUM, None)
     if checksum is not None and text(checksum) != content_digest(record):
         raise ValueError(DAMAGED)
@@ -257,7 +258,7 @@ class Design(Result):
     verified: bool = field(default=True, kw_only=True)
 
     def __init_subclass__(cls) -> None:
-        # The types of fields in a file are read from annotations as text.
+        # `_value` reads the type of a field from its annotation, which must therefore be text.
         if not all(isinstance(kind, str) for kind in vars(cls).get("__annotations__", {}).values()):
             raise TypeError(f"'{cls.__name__}' needs `from __future__ import annotations`")
 
@@ -275,7 +276,7 @@ class Design(Result):
 
     @classmethod
     def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
-        """Return a result with `own` fields; others are attributes of the first source with it."""
+        """Return a result with the fields `own`; others come from the first source with them."""
         names = [each.name for each in fields(cls) if each.init]
         for source in sources:
             own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own
@@ -294,7 +295,7 @@ class Design(Result):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Read a file as `load` does; `given` are the fields that files do not contain."""
+        """Read a file as `load` does; `given` sets the fields that files do not contain."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)
@@ -316,7 +317,7 @@ def record_of(design: Design) -> Record:
 
 
 def _saved(cls: type[Design]) -> list[Field[object]]:
-    """Return the fields that files contain."""
+    """Return the fields of a result that its file contains."""
     own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
     return [item for item in own if item.type != "Robot"]
 

@@ -1,4 +1,4 @@
-"""Rotations: cross-product matrices and Hamilton quaternions stored x, y, z, w."""
+"""Cross-product matrices, and rotations as Hamilton quaternions in the order x, y, z, w."""
 
 import math
 from typing import TypeVar
@@ -9,27 +9,27 @@ from fflin.base.validation import Array
 
 T = TypeVar("T", float, Array)
 
-# Row 3 i + j holds the entry (i, j) of [a]x as a linear function of a.
+# Row 3 i + j maps a vector a to the entry (i, j) of its cross-product matrix [a]x.
 _CROSS = np.zeros((9, 3))
 _CROSS[[7, 2, 3], [0, 1, 2]] = 1.0
 _CROSS[[5, 6, 1], [0, 1, 2]] = -1.0
 
 
 def skew(a: Array) -> Array:
-    """Return [a]x (..., 3, 3) of vectors (..., 3), with ``[a]x b = a x b``."""
+    """Return the cross-product matrices [a]x (..., 3, 3) of vectors, with ``[a]x b = a x b``."""
     if a.ndim == 1:
         return _CROSS.dot(a).reshape(3, 3)
     return (a @ _CROSS.T).reshape(*a.shape, 3)
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the matrix product a b for shapes (..., i, j) and (..., j, k)."""
+    """Return the matrix product ``a b`` for shapes (..., i, j) and (..., j, k)."""
     # `dot` takes half the time of `@` for two small matrices.
     return a.dot(b) if a.ndim == b.ndim == 2 else a @ b
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
-    """Return the Hamilton product a b (4,) of quaternions x, y, z, w, scaled to unit length."""
+    """Return the Hamilton product ``a b`` (4,) of two quaternions, scaled to unit length."""
     ax, ay, az, aw = a.tolist()
     bx, by, bz, bw = b.tolist()
     x = aw * bx + ax * bw + ay * bz - az * by
@@ -41,7 +41,7 @@ def quaternion_product(a: Array, b: Array) -> Array:
 
 
 def product_matrix(a: Array) -> Array:
-    """Return the matrix (4, 4) that maps a quaternion b to the product a b."""
+    """Return the matrix (4, 4) that maps a quaternion b to the product ``a b``."""
     x, y, z, w = a.tolist()
     return np.array(((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w)))
 

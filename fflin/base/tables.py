@@ -1,4 +1,4 @@
-"""Text tables with aligned columns, folded to the width of the terminal."""
+"""Text tables with aligned columns, wrapped to the width of the terminal."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def width() -> int:
 
 
 def folded(lines: Iterable[str]) -> str:
-    """Fold each line to the width, but not at no-break spaces; continuation lines are indented."""
+    """Wrap lines to the terminal's width, but not at no-break spaces; indent continued lines."""
     wrap = textwrap.TextWrapper(width(), subsequent_indent="  ", break_on_hyphens=False)
     return "\n".join(map(wrap.fill, lines)).replace("\u00a0", " ")
 
 
 def headed(command: str, report: str) -> str:
-    """Put the name of a command before its report, and fold the first paragraph again."""
+    """Put the name of a command before its report, and wrap the first paragraph again."""
     _, *rest = _PARAGRAPH.split(report, maxsplit=1)
     return "\n".join([folded([f"{command}: {first_paragraph(report)}"]), *rest])
 
@@ -43,7 +43,7 @@ def first_paragraph(report: str) -> str:
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
-    """Return the head and the first rows of a long table; `rest` locates the other rows."""
+    """Cut a long table to its header and first rows; `rest` says where the other rows are."""
     left = len(rows) - 1 - MOST_ROWS
     if left <= _SPARE:
         return list(rows)
@@ -81,12 +81,15 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 
 
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Format a matrix with names; "~0" is rounding error, zero rows and columns are left out."""
+    """Format a matrix with names of rows and columns; leave out rows and columns of zeros.
+
+    "~0" stands for an entry that is only a rounding error.
+    """
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # Columns that exceed the width continue below in blocks that show only their nonzero rows.
+    # Columns that do not fit into the width follow below, in blocks that show only nonzero rows.
     label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):
@@ -107,7 +110,10 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Estimate the rounding error of each entry from the largest entries of its row and column."""
+    """Estimate rounding errors as eps times the largest entry of the row or column.
+
+    The smaller of the two estimates applies to each entry.
+    """
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
     return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))

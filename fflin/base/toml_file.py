@@ -1,4 +1,4 @@
-"""TOML files: their values, and the line number of each key."""
+"""Reader of TOML files that gives the values, and the line number of each key."""
 
 import re
 import sys
@@ -19,7 +19,8 @@ else:
 # Largest size of a file [bytes], enough for about 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
-# The number of dots in a key is limited, because the parse time grows with its square.
+# The number of dots in a line is limited, because the time to parse a key grows with the square of
+# its number of dots.
 _DOTS_LIMIT = 1_000
 
 # Multi-line strings may contain lines that look like keys. One-line strings and comments are
@@ -34,13 +35,13 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 def is_number(value: object) -> bool:
     """Return whether a TOML value is a finite number."""
-    # The limit keeps the length of a vector of such numbers finite. It also excludes integers that
-    # no float can represent.
+    # The limit 1e100 keeps the norm of a vector of such numbers finite. It also excludes integers
+    # that no float can represent.
     return isinstance(value, int | float) and value is not True and abs(value) < 1e100
 
 
 class TomlFile:
-    """Content of a TOML file, and the line of each key path such as ``input``, 3, ``axis``."""
+    """Content of a TOML file, and the line of each key path, such as ("input", 3, "axis")."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -70,7 +71,7 @@ class TomlFile:
                 )
 
     def line(self, *key_path: str | int) -> int:
-        """Return the line number of a key, or of the table that contains it."""
+        """Return the line number of a key; if the key is missing, return the line of its table."""
         dotted = ".".join(map(str, key_path))
         while dotted and dotted not in self._lines:
             dotted = dotted.rpartition(".")[0]
@@ -83,7 +84,7 @@ class TomlFile:
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Add file, line and the prefix `of` to errors that name a key or a string of a table."""
+        """Begin an error with the file, the line of the key that it names, and the prefix `of`."""
         try:
             yield
         except FflinError as error:
@@ -91,7 +92,7 @@ class TomlFile:
             raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the path of the first key, string or pattern of a table in a message."""
+        """Return the path of the first key, string or pattern of a table that a message names."""
         head = ".".join(map(str, table)) + "."
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         found = re.findall(r"'([^']+)'| (\S+) is ", message)
@@ -108,7 +109,7 @@ class TomlFile:
 
 
 def flat(table: object) -> object:
-    """Flatten nested tables: ``a.b = 1``, read as a table in a table, becomes the name "a.b".
+    """Flatten nested tables, so that ``{"a": {"b": 1}}`` becomes ``{"a.b": 1}``.
 
     A value that is not a table is returned unchanged.
     """
@@ -122,7 +123,7 @@ def flat(table: object) -> object:
 
 
 def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:
-    """Yield (key path, value) of all values, at any depth, that are not tables or arrays."""
+    """Yield (key path, value) for the values at any depth, except tables and arrays."""
     left: list[tuple[tuple[str | int, ...], object]] = [((), record)]
     while left:
         key_path, value = left.pop()

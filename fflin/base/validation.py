@@ -1,4 +1,4 @@
-"""Checks of arguments, made once when a public function begins, and read-only arrays."""
+"""Argument checks, which public functions make once at their start, and read-only arrays."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ else:
 
 T = TypeVar("T")
 
-# A quaternion or a (cos, sin) pair is renormalised if its squared length differs from 1 by at most
-# this, because the difference is rounding error. A larger difference is an error in the input.
+# Largest error of the squared length of a quaternion or (cos, sin) pair that counts as rounding.
+# The quaternion or pair is then renormalised. A larger error is an error in the input.
 NORM_TOLERANCE = 1e-6
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
 
-# Native double precision. NumPy has only one native float64 type, so `is` can replace a comparison.
+# Native double precision. NumPy has only one object for this type, so `is` can replace `==`.
 DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
-    # For short vectors, Python's sum is faster than NumPy's and overflows without a warning.
+    # Python's sum is faster than NumPy's for short vectors, and does not warn if it overflows.
     if type(value) is np.ndarray and value.dtype is DOUBLE and value.shape == (size,):
         array: Array = value
         if math.isfinite(sum(array.tolist())):
@@ -53,7 +53,7 @@ def vector(name: str, value: object, size: int, of_what: str) -> Array:
 
 
 def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> Array:
-    """Return a new array of finite native floats of a shape, or raise `InputError`."""
+    """Return a new array of finite native floats with the given shape, or raise `InputError`."""
     array = as_double(name, value)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
@@ -95,7 +95,7 @@ def share(name: str, value: object) -> float:
 
 def refuse_masked(name: str, value: object) -> None:
     """Raise `InputError` if an entry is masked, because NumPy may ignore the mask."""
-    # A masked array exists only if this module is loaded.
+    # Masked arrays can exist only if numpy.ma is loaded.
     ma: ModuleType | None = sys.modules.get("numpy.ma")
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
@@ -109,7 +109,7 @@ def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expe
 
 
 def truth(name: str, value: object) -> bool:
-    """Return whether a switch is on, or raise `InputError` if it is not True or False."""
+    """Return a switch as a bool, or raise `InputError` if it is neither a bool nor an integer."""
     return bool(instance(name, value, (bool, np.bool_, int), "True or False"))
 
 
@@ -183,7 +183,7 @@ def _as_array(name: str, value: object) -> NDArray[np.generic]:
 
 
 class FrozenArrays:
-    """Mixin for frozen dataclasses: makes arrays read-only, and copies writeable arrays first."""
+    """Mixin for frozen dataclasses that replaces writeable arrays by read-only copies."""
 
     def __post_init__(self) -> None:
         for name, value in [*vars(self).items()]:
@@ -191,7 +191,7 @@ class FrozenArrays:
                 object.__setattr__(self, name, frozen(value.copy()))
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        # deepcopy and most pickle protocols create new writeable arrays, so they are frozen again.
+        # deepcopy and most pickle protocols create writeable arrays. Make these read-only again.
         for value in state.values():
             if isinstance(value, np.ndarray):
                 frozen(value)
@@ -199,7 +199,7 @@ class FrozenArrays:
 
 
 class Result(FrozenArrays):
-    """Mixin for results that files can contain; ``print`` shows their report."""
+    """Mixin for results that can be saved in files; ``print`` shows the report of a result."""
 
     verified: bool
 
@@ -216,7 +216,8 @@ class Result(FrozenArrays):
         return repr(self)
 
 
-# Parts of the title of a result: the text of each attribute that the result has.
+# Parts of the title of a result: {attribute: function that returns its text}. A result's title
+# contains the attributes that the result has.
 _TITLE: dict[str, Callable[[Any], str]] = {
     "robot": "'{}'".format,
     "__len__": lambda count: f"{count()} points",

@@ -19,7 +19,7 @@ from pathlib import Path
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
 
-# In folders with more names than this, no similar names are searched for.
+# Similar names are not searched for in a folder with more names than this.
 _MANY = 1000
 
 
@@ -75,9 +75,9 @@ def _failing(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
-    """Raise `FileError` if a command reads a file that it writes, or writes a file twice.
+    """Raise `FileError` if a command reads a file that it will write, or writes a file twice.
 
-    `inputs` are the files known at the start; `read_file` and `remember` add further files.
+    `inputs` are the input files known at the start; `read_file` and `remember` add further ones.
     """
     check_distinct(*(outputs := list(outputs)))
     token = _of_command.set((set(outputs), set()))
@@ -111,7 +111,7 @@ def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
 
 
 def write_atomically(contents: Mapping[Path, bytes]) -> None:
-    """Write files atomically: each is complete or, if anything fails, unchanged."""
+    """Write files atomically: each file is either written completely or left unchanged."""
     with replacing(*contents) as files:
         for file, content in zip(files, contents.values(), strict=True):
             file.write_bytes(content)
@@ -119,7 +119,7 @@ def write_atomically(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def replacing(*targets: Path) -> Iterator[list[Path]]:
-    """Yield a new file for each target, which replaces the target on success."""
+    """Yield a temporary file for each target; on success, these files replace the targets."""
     written: dict[Path, Path] = {}
     try:
         for target in targets:
@@ -139,7 +139,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 
 
 def install(temporary: Path, target: Path) -> None:
-    """Replace a target by its complete new file."""
+    """Replace a target by the temporary file, which has the complete new content."""
     real = followed_path(target)
     if real.exists():
         os.chmod(temporary, real.stat().st_mode & 0o777)
@@ -149,7 +149,7 @@ def install(temporary: Path, target: Path) -> None:
 
 
 def followed_path(target: Path) -> Path:
-    """Return the target with links followed, or raise `FileError` if it must not be written."""
+    """Follow a target's links to a file; raise `FileError` if this file must not be written."""
     real = Path(os.path.realpath(target))
     with _failing(target, "written"):
         try:
@@ -168,7 +168,7 @@ def followed_path(target: Path) -> Path:
 
 
 def check_output_path(target: Path) -> None:
-    """Raise `FileError` before any work is done if the target cannot be written."""
+    """Raise `FileError` if a target cannot be written; commands call this before any work."""
     from tempfile import TemporaryFile
 
     with _failing(target, "written"):
@@ -176,7 +176,7 @@ def check_output_path(target: Path) -> None:
 
 
 def check_distinct(*targets: Path | None) -> None:
-    """Raise `FileError` if two outputs are the same file after links are followed; skip None."""
+    """Raise `FileError` if two paths of outputs lead to the same file; ignore None."""
     seen: list[Path] = []
     for target in filter(None, targets):
         for first in seen:
@@ -188,7 +188,7 @@ def check_distinct(*targets: Path | None) -> None:
 
 
 def missing(path: Path, otherwise: str = "") -> str:
-    """Describe the folder that lacks a file, and the similar names in this folder."""
+    """Describe where a file is missing: give its folder, and similar names in this folder."""
     import difflib
 
     try:

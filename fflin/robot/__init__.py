@@ -1,5 +1,5 @@
 """Robots, made from a file or from a `pinocchio.Model`.
 
-This package contains the free-flying tree of joints, its inputs, outputs, springs and locks, and
-the catalogue of robot names. `robot.urdf` reads URDF files. Imports `base`.
+A robot is a free-flying tree of joints with inputs, outputs, springs and locked joints. The package
+also contains the catalogue of robot names; `robot.urdf` reads URDF files. It imports `base`.
 """

@@ -1,4 +1,4 @@
-"""Catalogue of the bundled and other robots, with their files of inputs and meshes."""
+"""Catalogue of robots: functions that find URDFs, files of inputs and meshes."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -11,7 +11,7 @@ from fflin.base.errors import FileError, InputError, require_known, unknown
 from fflin.base.validation import instance
 from fflin.base.writing import as_path, missing, shown
 
-# Robots of example-robot-data that code builds from another robot, so they have no URDF.
+# Robots that example-robot-data builds in code from another robot, so they have no URDF.
 _MADE_BY_CODE = ("talos_legs",)
 
 
@@ -40,7 +40,7 @@ def _bundled() -> dict[str, RobotFile]:
 
 @cache
 def _example_robot_data() -> dict[str, RobotFile]:
-    # Only class attributes are read, because an instance of a loader would load its meshes.
+    # Only class attributes of a loader are read, because creating the loader would load meshes.
     from example_robot_data.robots_loader import ROBOTS, getModelPath
 
     found = {}
@@ -79,7 +79,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     bundled = bundled_directory() / text
     if not os.path.exists(path) and bundled in bundled_directory().glob("*.toml"):
         path = bundled
-    # Path.exists would raise an error for a name that is too long.
+    # Unlike `os.path.exists`, Path.exists would raise an error for a name that is too long.
     if os.path.exists(path) and not (path.is_dir() and text in _example_robot_data()):
         # File names may contain bytes that are not valid text.
         name = path.stem.encode(errors="backslashreplace").decode()
@@ -92,7 +92,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by the name of a bundled robot, or otherwise by the file's path."""
+    """Find a file of inputs by its bundled name, or otherwise by its path."""
     path = as_path(inputs)
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     if str(inputs) in bundled:
@@ -103,7 +103,7 @@ def find_inputs(inputs: str | Path) -> Path:
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
-    """Return a given folder or list of folders as paths relative to the folder `within`."""
+    """Return one folder or a list of folders as paths, which are relative to `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):
         raise InputError(f"package_dirs is {given!r}, expected a list of folders")
@@ -111,7 +111,10 @@ def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """Return the file of package://NAME/PATH, file:///PATH or a path; None if it does not exist."""
+    """Return the file of a mesh, or None if it does not exist.
+
+    The URI of the mesh is package://NAME/PATH, file:///PATH or a path.
+    """
     scheme, separator, rest = uri.partition("://")
     candidates: Iterable[Path]
     if not separator:
@@ -123,5 +126,5 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         # A given folder may contain the package folder. Or it may be the package folder itself,
         # possibly under another name.
         candidates = (folder / part for part in (rest, inside) for folder in folders)
-    # Path.is_file would raise an error for a name that is too long.
+    # Unlike `os.path.isfile`, Path.is_file would raise an error for a name that is too long.
     return next((path for path in candidates if os.path.isfile(path)), None)

@@ -1,4 +1,4 @@
-"""Checks of the robot's fields that the user may set, and the limits of a robot."""
+"""Checks of the fields that a user may set on a robot, and the limits that the robot has."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ if TYPE_CHECKING:
     from fflin.robot.joints import Joint
     from fflin.robot.robot import Robot
 
-# Least and largest value; infinite without a limit.
+# Least and largest value; a value without a limit is infinite.
 Range: TypeAlias = tuple[float, float]
 
 RULES = ("urdf", "identity")
 
 
 def checked_inputs(value: object, bare: Robot, passive: Sequence[str]) -> tuple[Input, ...]:
-    """Check inputs of a robot without equipment; a pattern becomes a torque of each joint."""
+    """Check inputs; replace a torque on a pattern of joints by one torque for each joint.
+
+    `bare` is the robot without wheels and modes.
+    """
     if isinstance(value, str) or not isinstance(value, Sequence) or not value:
         raise InputError(f"inputs is {value!r}, expected a sequence of at least one input")
     inputs: list[Input] = []
@@ -74,7 +77,10 @@ def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
-    """Convert limits by name, or one for all inputs, to {input or state: (least, largest)}."""
+    """Return limits as {input or state: (least, largest)}.
+
+    The limits are given by name, or as one limit for all inputs.
+    """
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
@@ -95,7 +101,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
 
 
 def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
-    """Return outputs from `Output` objects or from texts as on the command line."""
+    """Return outputs from `Output` objects, or from text in the form of the command line."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
@@ -108,8 +114,9 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
 def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
     """Return the stiffness, damping or rest positions {joint: value}.
 
-    Stiffness and damping may be one value for all joints except wheels and modes, whose names must
-    be exact; damping may be "urdf".
+    One value of stiffness or damping applies to all joints except wheels and modes. Wheels and
+    modes must be named exactly, because patterns do not match them. The damping "urdf" stands for
+    the damping in the URDF.
     """
     if what == "damping" and isinstance(value, str):
         if value != "urdf":
@@ -128,7 +135,7 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
 
 
 def range_of(name: str, value: object) -> Range:
-    """Return (least, largest) from this pair or from one magnitude."""
+    """Return (least, largest) from such a pair, or (-size, size) from one magnitude."""
     what = f"limit of '{name}'"
     bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
     if len(bounds) == 2:
@@ -159,7 +166,7 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
 
 
 def _weights(value: object, robot: Robot) -> dict[str, object]:
-    """Check the weights of a robot's regulator; the keys are names of states and inputs."""
+    """Check the weights of a robot's regulator, whose keys name states and inputs."""
     states, inputs = state_keys(robot.joint_names), _input_keys(robot.inputs)
     kinds = {"q": states, "r": inputs, "bryson": (*states, *inputs)}
     given = _parts("weights", value, ("rule", *kinds))
@@ -183,7 +190,7 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
 
 
 def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
-    """Return the joints without a motor, in the order of the state."""
+    """Check the names of joints without a motor, and return them in the order of the state."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
@@ -198,8 +205,8 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
     return dict(value)
 
 
-# Checks of the fields, in the order in which a file applies them: inputs come before the fields
-# that refer to their names. `Robot.replace` itself checks the first three.
+# Checks of the fields, in the order in which a robot file applies them. Inputs come before the
+# fields that refer to the inputs by name. `Robot.replace` checks the first three fields itself.
 FIELDS: dict[str, Callable[[object, Robot], Any]] = {
     **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
     "outputs": _outputs,
@@ -217,8 +224,8 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Start with the limits of the URDF, where exporters write zero for no limit. Limits of the
-    # inputs replace them, and `Robot.limits` replaces both.
+    # Start with the limits of the URDF; a limit of zero counts as no limit, because exporters write
+    # it. Limits of the inputs override the URDF, and `Robot.limits` overrides both.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         low, high = travel_of(robot.model, joint)
@@ -257,9 +264,10 @@ def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:
-    """Return {input or state: magnitude} of all finite limits.
+    """Return {input or state: magnitude} for all limits whose magnitude is finite and not zero.
 
-    For a joint position the magnitude is the whole travel, and for a one-sided input the range.
+    For a joint position, the magnitude is the range from the lower to the upper limit. The same
+    holds if the lower limit is not negative. Otherwise, it is the smaller of both magnitudes.
     """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
@@ -269,7 +277,7 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
 
 def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return the saturation limits of the inputs for `simulate`, and all known limits."""
+    """Return the limits at which `simulate` saturates inputs, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
@@ -287,7 +295,7 @@ def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[
 
 
 def travel_of(model: pin.Model, joint: Joint) -> Range:
-    """Return the position limits of a joint in its model, infinite without limits."""
+    """Return the position limits of a joint in its model; a missing limit is infinite."""
     if joint.unbounded:
         return _OPEN
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
@@ -295,7 +303,7 @@ def travel_of(model: pin.Model, joint: Joint) -> Range:
 
 
 def _either(size: float) -> Range:
-    """Return the range (-size, size), or an infinite range for a size of zero."""
+    """Return the range (-size, size), or an infinite range if the size is not positive."""
     return (-_known(size), _known(size)) if size > 0.0 else _OPEN
 
 

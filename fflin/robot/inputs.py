@@ -51,7 +51,7 @@ class Input:
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """Least and largest value (least, largest) of each entry; infinite without a limit."""
+        """Range (least, largest) of each entry; a value without a limit is infinite."""
         largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
         least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
@@ -59,7 +59,7 @@ class Input:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Names of the model's frames in which this input is fixed."""
+        """Names of the model's frames on which this input is mounted."""
         frame: str | None = getattr(self, "frame", None)
         return () if frame is None else (frame,)
 

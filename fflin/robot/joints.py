@@ -1,4 +1,4 @@
-"""Joints and frames of a tree by name, and its configurations in Pinocchio's order."""
+"""Joints and frames of a model by name, and checks of configurations in Pinocchio's order."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
-# Largest rounding error of the length of a normalised quaternion: two ulp of 1.
+# Largest rounding error of the squared length of a normalised quaternion: two ulp of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
-# pin.Data contains third-order tensors of nv^3 entries. It takes about 32 nv^3 bytes.
+# pin.Data takes about 32 nv^3 bytes, because it contains third-order tensors of nv^3 entries.
 _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
@@ -37,12 +37,12 @@ class Joint(NamedTuple):
     idx_v: int = 0  # index of its entry in Pinocchio's v
     unbounded: bool = False  # continuous: two entries (cos, sin) of q, but one angle in the state
     prismatic: bool = False  # position is a length [m] instead of an angle [rad]
-    # "joint", "slosh", or "modal" for the amplitude of a mode.
+    # "joint", "slosh" for a coordinate of a sloshing mass, or "modal" for a modal amplitude.
     kind: str = "joint"
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
     # Inertia of a mode when its link is fixed in space; 1 for a modal amplitude.
     inertia: float = 1.0
-    # Rotation [rad] of the structure per unit of a mode; 0 without rotation.
+    # Largest rotation [rad] of the structure per unit of a mode; 0 if it does not rotate.
     rotation: float = 0.0
 
     @property
@@ -73,22 +73,22 @@ class Joint(NamedTuple):
             q[self.idx_q] = self.scale * value
 
     def value(self, q: Array) -> float:
-        """Return this joint's value [rad|m|kg^0.5 m]; continuous joints are in (-pi, pi]."""
+        """Return this joint's value [rad|m|kg^0.5 m]; a continuous angle is in (-pi, pi]."""
         return float(self.values(q))
 
     def values(self, q: Array) -> Array:
-        """Return this joint's values (..) as in `value` at configurations q (nq, ..)."""
+        """Return this joint's values (..) at configurations q (nq, ..); see `value`."""
         at: Array = q[self.idx_q]
         return np.arctan2(q[self.idx_q + 1], at) if self.unbounded else at / self.scale
 
     def within(self, model: pin.Model) -> Joint:
-        """Return this joint with the indices of the joint of the same name in another model."""
+        """Return this joint with the indices that it has in another model, found by name."""
         joint = model.joints[model.getJointId(self.name)]
         return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
 
 
 class Follower(NamedTuple):
-    """Mimic joint, with value = multiplier * leader's value + offset."""
+    """Mimic joint, whose position is ``multiplier * leader's position + offset``."""
 
     joint: Joint
     leader: Joint
@@ -121,7 +121,7 @@ def frame_index(model: pin.Model, name: str) -> int:
     # Pinocchio's own search refuses a name that a link and a joint share. It also mistakes a link
     # named "universe" for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
-    # The type is checked because comparing a name with an array gives an array instead of a bool.
+    # The type is checked first, because the comparison of a string with an array gives an array.
     found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not found:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
@@ -129,7 +129,7 @@ def frame_index(model: pin.Model, name: str) -> int:
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
-    """Return the location of a frame (see `frame_index`), or of the base's root frame for None."""
+    """Return the location of a frame; None means the frame of the base's root joint."""
     if name is None:
         return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
@@ -146,7 +146,7 @@ def find_joint(model: pin.Model, name: str) -> Carried:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Coordinates:
-    """Configuration q and velocity v of a robot, and checks of given values."""
+    """Coordinates of a robot, and checks of given configurations q and velocities v."""
 
     model: pin.Model
     name: str
@@ -154,8 +154,8 @@ class Coordinates:
     followers: tuple[Follower, ...] = ()
     # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy of it. The copy shows whether the model has changed since it was
-    # copied.
+    # The model, and a copy made with the robot. Their comparison shows whether the model has
+    # changed since.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     @cached_property
@@ -192,12 +192,12 @@ class Coordinates:
         return q
 
     def follow(self, q: Array) -> None:
-        """Write the values of mimic joints, which follow their leaders, into q (nq, ..)."""
+        """Set mimic joints in q (nq, ..) to the values that follow from their leaders."""
         for joint, leader, multiplier, offset in self.followers:
             joint.place(q, multiplier * leader.values(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
-        """Return a valid configuration q (nq,), corrected within 1e-6, or raise `InputError`."""
+        """Return q (nq,) with errors of up to 1e-6 corrected, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = self._sized("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
@@ -241,7 +241,7 @@ class Coordinates:
         return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:
-        """Return a copy of q (nq,) with mimic joints corrected if they are within 1e-6."""
+        """Return a copy of q (nq,) with mimic joints corrected; refuse errors above 1e-6."""
         placed = q.copy()
         self.follow(placed)
         for joint, leader, *_ in self.followers:
@@ -283,7 +283,7 @@ def require_room(model: pin.Model, name: str) -> None:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Return the name of a changed part on which A, B and C depend, or an empty text.
+    """Return the name of a changed part on which A, B or C depends, or an empty text.
 
     Changed limits and new frames are ignored.
     """

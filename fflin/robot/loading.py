@@ -31,7 +31,7 @@ from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
 
-# Fields that a TOML file writes as arrays of tables ([[input]]): {field: names of the arrays}.
+# Fields written as arrays of tables in TOML, such as [[input]]: {field: names of the arrays}.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
 # Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
@@ -115,7 +115,8 @@ def load(
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
-    # Meshes are read only when the robot is drawn, so output files must not overwrite them.
+    # Register the meshes, because they are read only later, when the robot is drawn. An output file
+    # must not overwrite them.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
     loaded = replace(
         loaded,
@@ -138,7 +139,7 @@ def load(
     if later:
         loaded = welded(loaded, later)
     loaded = loaded.merged(fields)
-    # Fields of the robot resolve some warnings, if they name all joints of the warning.
+    # Leave out a warning if each of its joints is locked or is named in the warning's field.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
     for field, names, text in ignored(urdf.joints, found.path.stem):
@@ -149,8 +150,7 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # Add a note instead of a warning, because every function that inverts M raises an error
-        # anyway.
+        # Add a note without a warning, because every function that inverts M raises an error.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
 
@@ -207,7 +207,7 @@ def from_model(
 
 
 def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
-    """Make a robot of a model, which must be one depth-first tree on one free-flyer."""
+    """Make a robot from a model, which must be one tree in depth-first order on a free-flyer."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -234,14 +234,15 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
             "wrong results; add all joints of one branch before the joints of the next branch"
         )
     damping = {joint.name: float(model.damping[joint.idx_v]) for joint in joints}
-    # Damping of a mimic joint is added to its leader so that the dissipated power remains the same.
+    # The damping of a mimic joint is moved to its leader. The factor multiplier^2 keeps the
+    # dissipated power.
     for each, leader, multiplier, _ in followers:
         damping[leader.name] += multiplier**2 * float(model.damping[each.idx_v])
     return Robot(model, name, joints, followers, locked=locked, urdf_damping=damping)
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Raise `ModelError` if a joint or body has physically impossible numbers."""
+    """Raise `ModelError` if a value of a joint or body is not finite or physically impossible."""
     for index in range(ROOT, model.njoints):
         body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
@@ -345,7 +346,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
 
 def _document(path: Path) -> TomlFile:
-    """Return a file of inputs or a robot file, or raise `UnknownNameError` for an unknown key."""
+    """Read a robot file or a file of inputs; raise `UnknownNameError` for an unknown key."""
     document = TomlFile(path)
     for key in document.record:
         if key not in KEYS:
@@ -356,7 +357,7 @@ def _document(path: Path) -> TomlFile:
 def _read_robot_file(
     file: RobotFile,
 ) -> tuple[TomlFile, RobotFile, dict[str, float | None], dict[str, object]]:
-    """Return a robot file, its URDF, the joints that it locks, and its fields in order."""
+    """Read a robot file; return it, its URDF, its locks, and its fields in `FIELDS` order."""
     document = _document(file.path)
     record, folder = document.record, file.path.parent
     if "urdf" not in record:
@@ -370,7 +371,7 @@ def _read_robot_file(
             raise InputError(f"urdf is {found.path}, expected a URDF or a robot's name")
     with document.located("package_dirs"):
         dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
-    # Nested tables become names with dots, except for the parts of weights and states.
+    # Nested tables become keys with dots. The parts of weights and states remain tables.
     values = {
         key: {part: flat(x) for part, x in value.items()}
         if key in ("weights", "point", "target", "start") and isinstance(value, dict)
@@ -413,7 +414,7 @@ def _read_appendages(document: TomlFile) -> list[Appendage]:
         ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
         ("slosh", Slosh, Slosh.cylinder),
     ):
-        # These keys are valid only for a Nastran file, or only for a cylinder.
+        # `alone` contains the keys that are valid only for a Nastran file or a cylindrical tank.
         alone = set(signature(special).parameters) - set(signature(make).parameters)
         for index, table in enumerate(_tables(document, key)):
             values = {**table}
@@ -425,7 +426,7 @@ def _read_appendages(document: TomlFile) -> list[Appendage]:
 
 
 def _tables(document: TomlFile, key: str) -> list[dict[str, object]]:
-    """Return an array of tables of a file, empty if there is none."""
+    """Return an array of tables from a file, or an empty list if the file has no such array."""
     tables = document.record.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
         raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)

@@ -1,4 +1,4 @@
-r"""Mass of each link as in the URDF, changes of bodies, and motions that move no mass.
+r"""Mass properties of links and bodies, their changes, and motions without kinetic energy.
 
 A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
 moments of its mass distribution about c are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-# Largest relative rounding errors of a sum of bodies, and of a second moment of mass.
+# Largest relative rounding errors: of a sum of inertias, and of a principal or second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
-# Singular values below this fraction of the largest count as zero. Rounding errors are 1e-15 of the
-# largest, and the smallest true value, for links 1e7 m apart, is 1e-7 of the largest.
+# Singular values below this fraction of the largest count as zero. Rounding errors are about 1e-15
+# of the largest. The smallest true value is 1e-7 of the largest, for links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message names a coordinate if its component of a motion with unit norm exceeds this value.
+# A message names a coordinate if its component of a motion of unit norm exceeds this value.
 _INVOLVED = 0.1
 
-# Relative asymmetry up to which a body counts as symmetric, for the rounding of numbers in a URDF.
+# Largest relative asymmetry of a symmetric body. It results from the rounding of numbers in a URDF.
 _ASYMMETRY = 1e-12
 
 
 def dynamic_parameters(model: pin.Model) -> bytes:
-    """Return the mass properties of all bodies, for a hash of the robot."""
+    """Return the mass properties of all bodies as bytes, for a hash of the robot."""
     return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
-    """Return {joint: body} from the argument of `Robot.with_mass_properties`."""
+    """Return {joint index: inertia} from the argument of `Robot.with_mass_properties`."""
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     first_link, links = len(index_of), dict[int, list[str]]()
@@ -73,7 +73,7 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
 
 
 def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
-    """Return a body from an inertia, or from changed parts of the old body."""
+    """Return the new inertia of a body; `value` is an inertia, or the changes of the old one."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):
         value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
@@ -103,7 +103,7 @@ def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
 
 
 def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pin.Inertia]:
-    """Return {joint: body} with random changes of all bodies; see `Robot.perturbed`."""
+    """Return {joint index: inertia} with random changes of all bodies; see `Robot.perturbed`."""
     checked = {key: number(key, value) for key, value in spreads.items()}
     for key, spread in checked.items():
         if not 0.0 <= spread < 1.0:
@@ -113,7 +113,7 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(checked.values()):
             body = model.inertias[index]
-            # Root mean square distances [m] of the body's mass from its centre, per axis.
+            # Root mean square distance [m] of the body's mass from its centre, along each axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
             density, com = checked["mass"] * drawn[:, 0], checked["com"] * drawn[:, 1:4] * radii
@@ -126,16 +126,16 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
 def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inertia: Array) -> Array:
     """Return the pseudo-inertias (N, 4, 4) of N variants of a body.
 
-    `density` (N,) and `inertia` (N, 3) are relative changes. `com` (N, 3) [m] shifts the centre of
-    mass, and changes neither the mass nor the inertia about the centre. Shifts and changes of
-    inertia are along `axes`, which are the columns of a matrix (3, 3).
+    `density` (N,) is a relative change of density, and `inertia` (N, 3) of the second moments about
+    the centre of mass. `com` (N, 3) [m] shifts the centre of mass, and changes neither the mass nor
+    the inertia about the centre. Both `inertia` and `com` are along the columns of `axes` (3, 3).
     """
-    # Some files contain physically impossible bodies, which are scaled equally along all axes.
+    # Some files contain physically impossible bodies. These are scaled equally along all axes.
     least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
     if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
         inertia = inertia[:, :1] * np.ones(3)
-    # The affine map T of the mass distribution makes T P T^T of P, which remains positive definite.
-    # T stretches the body about its centre of mass, and then shifts it.
+    # An affine map T of the mass distribution changes P to T P T^T. If P is positive definite, the
+    # product is too. T stretches the body about its centre of mass, and then shifts it.
     T = np.zeros((len(com), 4, 4))
     T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
     T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever
@@ -145,7 +145,7 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
 
 
 def properties(P: Array) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of pseudo-inertias (N, 4, 4)."""
+    """Return masses (N,), centres of mass (N, 3) and inertias about them, from P (N, 4, 4)."""
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
     second = P[:, :3, :3] - mass[:, None, None] * com[:, :, None] * com[:, None]
@@ -154,7 +154,7 @@ def properties(P: Array) -> tuple[Array, Array, Array]:
 
 
 class LinkMass(NamedTuple):
-    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the origin of `placement`."""
+    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the centre of mass."""
 
     mass: float
     inertia: Array
@@ -162,7 +162,7 @@ class LinkMass(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Mass properties of a link, or of a whole body, on the joint that moves it."""
+    """Mass properties of a link or of a whole body, and the joint that moves it."""
 
     joint: int
     placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
@@ -173,10 +173,11 @@ class Piece(NamedTuple):
 
 
 def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
-    """Return {name: piece} and {body: link}.
+    """Return {name: piece}, and {body: link} for bodies of one link.
 
-    The pieces are all links, and all bodies of several links. A body of one link is given by the
-    name of this link.
+    The pieces are all links, and all bodies that have no link or several links. For a body of one
+    link, the piece has the name of the link. If the links of a body do not add up to the body, only
+    the body is a piece.
     """
     model, found, also = robot._bare.model, dict[str, Piece](), dict[str, str]()
     of_body: dict[int, dict[str, Piece]] = {}
@@ -199,14 +200,14 @@ def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
         alone = next(iter(named)) if len(named) == 1 else own
         also |= {own: alone} if alone != own else {}
         found.setdefault(alone, whole)
-    # Wheels are inserted between the joints, so the joints' indices differ from the bare robot's.
+    # Wheels are inserted between the joints, so a joint has another index than in the bare model.
     now = [robot.model.getJointId(name) for name in model.names]
     now[ROOT] = ROOT
     return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}, also
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
-    """Return the names in `pieces` of the links and bodies that match a name or pattern."""
+    """Return the names of the pieces (links and bodies) that match a name or pattern."""
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
@@ -217,7 +218,7 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
 
 
 def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
-    """Return the names of the pieces that are bodies whose links are pieces as well."""
+    """Return the names of pieces that are the sum of other pieces: bodies of several links."""
     linked = {each.joint for each in pieces.values() if not each.whole}
     return {name for name, each in pieces.items() if each.whole and each.joint in linked}
 
@@ -230,9 +231,8 @@ def as_inertia(piece: Piece) -> pin.Inertia:
 def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
     """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one link.
 
-    `mass` (N,), `density` (N,) and `inertia` (N, 3) are relative changes; `com` (N, 3) [m] shifts
-    the centre of mass. Changes of inertia and shifts are along the axes of the link. A change of
-    mass does not change the inertia about the centre of mass.
+    `mass` (N,) is a relative change of mass, which keeps the inertia about the centre of mass. The
+    other arguments are as in `_stretched`; `inertia` and `com` are along the axes of the link.
     """
     body = as_inertia(piece)
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
@@ -242,10 +242,10 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    """Return the coordinates that can move together without moving mass; usually an empty tuple."""
-    # A motion has no kinetic energy if it moves no mass, rotates no body about an axis with
-    # inertia, and moves no joint with armature. This condition depends on geometry alone. Values
-    # of masses are not used, because their rounding errors could hide it.
+    """Return the coordinates of motions without kinetic energy; usually an empty tuple."""
+    # A motion has no kinetic energy if it moves no centre of mass, rotates no body about an axis
+    # with inertia, and moves no joint with armature. The test uses only which masses and moments
+    # are zero. It does not use their values, because rounding errors could hide such a motion.
     bodies = robot.model.inertias.tolist()[ROOT:]
     moments = [np.linalg.eigh(body.inertia) for body in bodies]
     if all(
@@ -253,7 +253,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         for body, (values, _) in zip(bodies, moments, strict=True)
     ):
         return ()
-    # v = columns @ nu, where mimic joints follow their leaders.
+    # The independent rates nu determine v = columns @ nu, since mimic joints follow their leaders.
     columns = np.eye(robot.nv)
     for joint, leader, multiplier, _ in robot.followers:
         columns[joint.idx_v, leader.idx_v] = multiplier
@@ -261,7 +261,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     idle: tuple[str, ...] = ()
-    # If M is singular at two random configurations, it is singular at every configuration.
+    # If M is singular at two random configurations, it is almost surely singular at all of them.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -277,7 +277,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
 
 
 def coordinate_names(robot: Robot) -> list[str]:
-    """Return names for messages of the 6 + n velocity coordinates, in state order."""
+    """Return the names of the 6 + n velocity coordinates for messages, in state order."""
     return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
 
 
@@ -291,13 +291,13 @@ def massless_note(robot: Robot) -> str:
 
 
 def require_inertia(robot: Robot) -> None:
-    """Raise an error if M is singular at every configuration; a factorisation may not show this."""
+    """Raise `SingularInertiaError` if M is always singular; a factorisation may not detect it."""
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the matrix (k, nv) that maps v to all velocities on which the energy depends."""
+    """Return the matrix (k, nv) that maps v to the velocities in the kinetic energy."""
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)
     rows = [np.eye(model.nv)[model.armature > 0.0]]
@@ -312,12 +312,15 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
 
 
 def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of rotors: symmetric joints that carry no other joint."""
+    """Return the names of rotors: joints of a body that is symmetric about the joint axis.
+
+    A rotor carries and leads no other joint, and has no spring. It carries no frame of an input or
+    an output.
+    """
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
     named = set(robot.used_frames)
-    # These joints are not rotors: they carry or lead another joint, or have a spring, input or
-    # output.
+    # `busy` contains the indices of joints that cannot be rotors.
     busy = set(model.parents.tolist())
     busy |= {index_of[follower.leader.name] for follower in robot.followers}
     busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}

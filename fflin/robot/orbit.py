@@ -12,7 +12,8 @@ from typing import Any
 from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import instance, number, positive
 
-# Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
+# Gravitational parameter [m^3/s^2] and equatorial radius [m] of a body: WGS 84 for the earth, JPL
+# ephemerides and IAU 2015 for the other bodies.
 BODIES = {
     "earth": (3.986004418e14, 6378137.0),
     "moon": (4.902800118e12, 1737400.0),
@@ -119,7 +120,8 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Do not warn if `mu` is given: the orbit was saved, or "earth" names another body.
+            # Do not warn if `mu` is given. The orbit then comes from a file, or "earth" is the name
+            # of another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 said = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
                 said += "; altitudes are in metres, so write 400 km as 400e3"
@@ -159,7 +161,7 @@ class CircularOrbit:
 
 
 def checked_orbit(value: object) -> CircularOrbit | None:
-    """Return the orbit from an orbit, an altitude [m], a mapping of parts, or None."""
+    """Return an orbit given as an orbit, an altitude [m] or a mapping; return None for None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

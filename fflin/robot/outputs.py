@@ -28,7 +28,7 @@ class Output:
 
     @property
     def signals(self) -> list[tuple[str, str]]:
-        """(name, unit) of each component that is not a state."""
+        """(name, unit) of each component of the output; empty if the output consists of states."""
         prefix = "/".join(self.frames) + "." * bool(self.frames)
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
@@ -75,7 +75,7 @@ class BasePose(Output):
 
 @dataclass(frozen=True)
 class JointOutput(Output):
-    """Base class of outputs of joints, by default of all joints."""
+    """Base class of outputs of chosen joints, or by default of all joints."""
 
     joints: tuple[str, ...] | None = None
 
@@ -283,7 +283,7 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Read outputs of the command line: WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
+    """Parse an output from the command line: WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     require_known("output", [word], kinds)

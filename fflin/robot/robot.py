@@ -33,14 +33,14 @@ from fflin.robot.outputs import FullState, Output
 
 
 class Springs(NamedTuple):
-    """Springs and dampers of the force -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
+    """Stiffness, damping and rest positions, each (n,), of the springs and dampers of joints."""
 
     stiffness: Array
     damping: Array
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) of springs and dampers at q_m (.., n) and rates (.., n)."""
+        """Return the forces (.., n) on joints with positions q_m (.., n) and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -252,7 +252,7 @@ class Robot(Coordinates):
             robot = with_appendages(robot, fields["appendages"])
         own = ("passive", "inputs", "appendages")
         checked = {k: FIELDS[k](value, robot) for k, value in fields.items() if k not in own}
-        # Without `merged`, only modes keep their values unless they are named.
+        # With `merged`, joints that are not named keep their values. Otherwise, only modes do.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
             if key in checked:
@@ -348,7 +348,7 @@ class Robot(Coordinates):
         changed: Robot = equipped(self, other)
         if not self.modes:
             return changed
-        # The joints remain the same, so configurations keep their modal amplitudes.
+        # Keep the joints of the modes, so that the modal amplitudes keep their meaning in q.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
@@ -435,5 +435,5 @@ class Robot(Coordinates):
 
     @property
     def _bare(self) -> Robot:
-        """The robot without its wheels and modes; itself if it has none."""
+        """The robot without joints of wheels and modes; the robot itself if it has none."""
         return self._unequipped or self

@@ -28,7 +28,7 @@ _SWING, _DAMPED = math.pi, 0.01
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:
-    """Return a text about a robot's tree, masses and limits, which includes `at_point`."""
+    """Return text about a robot's tree, masses and limits; `at_point` follows the first lines."""
     modes = {joint.name for joint in robot.modes}
     inputs = sum(len(names) for _, names in named_inputs(robot.inputs))
     counts = [
@@ -54,7 +54,7 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
 
 
 def _tree(robot: Robot) -> list[list[str]]:
-    """Return a table with one row for each body, indented by its depth in the tree."""
+    """Return a table with a row for each body except modes, indented by depth in the tree."""
     model = robot.model
     masses = [body.mass for body in model.inertias.tolist()]
     for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
@@ -82,7 +82,7 @@ def _tree(robot: Robot) -> list[list[str]]:
 
 
 def _settings(robot: Robot) -> list[str]:
-    """Return lines about settings that the URDF does not contain, except inputs and orbit."""
+    """Return lines about the robot's settings that are not in the URDF; skip inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
     shown: dict[str, object] = {
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
@@ -117,7 +117,7 @@ def _indented(text: str, below: str) -> str:
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the draft of a robot file for a robot that has only a URDF, with the path `urdf`."""
+    """Return the draft of a robot file for a robot from a URDF; `urdf` is the path to write."""
     from importlib.resources import files
 
     model = robot.model
@@ -160,7 +160,7 @@ def draft(robot: Robot, urdf: str) -> str:
 
 
 def _candidates(robot: Robot) -> tuple[str, list[str]]:
-    """Return the inputs that names of links suggest, as TOML comments, and the joints of wheels."""
+    """Return inputs that link names suggest, as TOML comments, and the joints of likely wheels."""
     model, data = robot.model, robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())
     text, spun = "", []

@@ -1,4 +1,4 @@
-"""Welding of joints at given values, and of one robot to a frame of another."""
+"""Weld joints at given values, or weld the base of one robot to a frame of another robot."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def welded(robot: Robot, lock: Lock) -> Robot:
-    """Return a robot with joints welded at given values, and with locked wheels welded."""
+    """Return a robot with joints and wheels welded; `lock` gives the values of the joints."""
     bare, asked = robot._bare, requested(lock)
     wheels = {name for name in asked if name in robot.wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}
@@ -59,7 +59,10 @@ def welded(robot: Robot, lock: Lock) -> Robot:
 def locked_model(
     model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints and their mimic joints; return model, remaining mimic joints, welded joints."""
+    """Weld joints and their mimic joints.
+
+    Return the model, the remaining mimic joints, and the text "NAME=VALUE" for each welded joint.
+    """
     movable = list(model.names)[ROOT + 1 :]
 
     def find(name: str) -> None:
@@ -110,7 +113,7 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
     """Return a robot with another robot's base welded to a frame.
 
-    The names of the other robot become PREFIX.NAME, and its joints have no motors.
+    The names of the other robot change to PREFIX.NAME, and its joints have no motors.
     """
     bare = robot._bare
     if not prefix or "." in prefix:
@@ -154,7 +157,10 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
 def _appended(
     model: pin.Model, frame: str, other: pin.Model, placement: pin.SE3, prefix: str
 ) -> pin.Model:
-    """Return a model with the other model's joints inserted after all joints carried by a frame."""
+    """Return a model with another model welded to a frame.
+
+    The joints of the other model come after all joints that the body of the frame carries.
+    """
     joint, at = find_frame(model, frame)
     other = other.copy()
     other.jointPlacements[ROOT] = pin.SE3.Identity()

@@ -1,13 +1,15 @@
-r"""Flexible appendages and slosh: passive degrees of freedom of a link, as bodies on joints.
+r"""Flexible appendages and slosh of a link, modelled as bodies on passive joints.
 
-Let an appendage be clamped to a frame that moves with the twist V. With modal amplitudes
-:math:`\eta` of unit modal mass and the participation L (6, k), its kinetic energy is
+An appendage with the rigid inertia :math:`M_{rr}` is clamped to a frame that moves with the twist
+V. Its k modes have the amplitudes :math:`\eta`, unit modal mass and the participation L (6, k). The
+kinetic energy of the appendage is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is equivalent to one ball on one screw joint. The ball's spatial inertia I and the twist S
-per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted from the link's inertia,
-so that the sum of both is the link in the URDF.
+Each mode is equivalent to one ball on one screw joint. The ball has the spatial inertia ``I``, and
+moves by the twist ``S`` per unit amplitude. For the mode's column ``l`` of L, these satisfy
+``I S = l`` and ``S^T I S = 1``. The ball is subtracted from the link's inertia, so that the link
+and the ball together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0: the wavenumber times the radius of the first lateral mode in a
-# circular cylinder.
+# First root of J_1'(x) = 0. For the first lateral mode in a circular cylinder, this is the
+# wavenumber times the radius of the cylinder.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -81,8 +83,8 @@ class FlexibleAppendage(FrozenArrays):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # M_rr (6, 6) from a file, about the frame's origin, with translation before rotation. `rigid`
-    # is true if this inertia replaces the inertia of the URDF.
+    # Rigid inertia M_rr (6, 6) from a file, about the frame's origin; translation is before
+    # rotation. `rigid` is true if this inertia replaces the inertia of the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -445,8 +447,8 @@ Appendage: TypeAlias = FlexibleAppendage | Slosh
 
 
 def rigid_inertia(M: Array) -> pin.Inertia:
-    """Convert a rigid-body mass matrix (6, 6), translation before rotation, to an inertia."""
-    # Mass, first moments, and the moments of inertia xx, xy, yy, xz, yz, zz.
+    """Convert a rigid-body mass matrix (6, 6) to an inertia; translation is before rotation."""
+    # Pinocchio's parameters: mass, first moments, and moments of inertia xx, xy, yy, xz, yz, zz.
     entries = M[[0, 1, 2, 0, 3, 3, 4, 3, 4, 5], [0, 5, 3, 4, 3, 4, 4, 5, 5, 5]]
     return pin.Inertia.FromDynamicParameters(entries)
 

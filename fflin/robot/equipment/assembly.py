@@ -1,8 +1,9 @@
 r"""A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model.
 
-Each mode with participation L is equivalent to one ball on one screw joint. The ball's spatial
-inertia I and the twist S per unit amplitude satisfy I S = L and S^T I S = 1. The ball is subtracted
-from the link's inertia, so that the sum of both is the link in the URDF.
+Each mode of a flexible appendage is equivalent to one ball on one screw joint. The ball has the
+spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. For the participation ``l``
+(6,) of the mode, these satisfy ``I S = l`` and ``S^T I S = 1``. The ball is subtracted from the
+link's inertia, so that the link and the ball together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -34,24 +35,24 @@ from fflin.robot.urdf.description import is_impossible
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-# An eigenvalue of M_rr - L L^T counts as negative if it is below minus this fraction of the
-# largest eigenvalue of M_rr.
+# Rounding errors can make an eigenvalue of M_rr - L L^T negative. A negative eigenvalue is accepted
+# if its magnitude is at most this fraction of the largest eigenvalue of M_rr.
 _NEGATIVE = 1e-9
-# A larger relative difference between mass properties of a file and of the URDF causes a warning.
+# Largest relative difference between the inertias of a file and of the URDF without a warning.
 _AGREE = 1e-2
-# Largest fraction of a body's mass in the balls of its modes. CRBA sums inertias inwards, and the
-# mass of each sum must be positive.
+# Largest total mass of the balls on a body, as a fraction of the body's mass. The remaining mass
+# must be positive, because CRBA adds inertias from the tips to the base, and each sum needs a mass.
 _LARGEST_SHARE = 0.9
-# Least distance of a ball from its appendage's frame, relative to the body's radius of gyration,
-# for which the ball's motion counts as a rotation about the frame.
+# A ball's displacement counts as a rotation about its appendage's frame if their distance is at
+# least this fraction of the body's radius of gyration.
 _SHORTEST = 0.05
-# Least mass of a ball, relative to the mass with which no rotor is needed.
+# Least mass of a ball, as a fraction of the mass with which its joint needs no rotor inertia.
 _LIGHTEST = 1e-6
-# If the translation part of a participation is below this fraction of the rotation part, or vice
-# versa, it counts as zero.
+# The translation part of a participation counts as zero if it is below this fraction of the
+# rotation part, and vice versa.
 _NONE = 1e-14
 
-# Fields of a robot by names of joints, and the groups of names in their keys.
+# Fields of a robot whose keys name joints, and the groups of names that these keys may contain.
 _BY_NAME = (
     *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
     *("point", "target", "start"),
@@ -66,10 +67,11 @@ def equipped(
     inputs: object = None,
     appendages: Sequence[Appendage] | None = None,
 ) -> Robot:
-    """Return a robot with other inputs, appendages or another robot without equipment.
+    """Return a robot with other inputs, other appendages, or another robot without equipment.
 
-    What is not given remains the same. Wheels with inertia and modes become joints, and fields lose
-    the entries of joints that no longer exist.
+    `bare` is the robot without wheels and modes. Arguments that are not given keep their values.
+    Modes become joints, and wheels that have an inertia do too. Entries of joints that no longer
+    exist are removed from the fields.
     """
     before, bare = robot._bare, bare or robot._bare
     checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
@@ -95,13 +97,13 @@ def equipped(
     gone = [name for name in robot.joint_names if name not in names]
     fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
     modes = {joint.name for joint in robot.modes}
-    # Without new appendages, the springs of modes may have been replaced since.
+    # Only new appendages reset the springs of modes, because a user may have changed the springs.
     for name in ("stiffness", "damping") if appendages is not None else ():
         of_joints = fields.get(name, getattr(robot, name))
         fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
         for item in items:
             fields[name] |= item.springs[name]
-    # Locked joints are not named here, because the robot without equipment lacks them as well.
+    # Remember only the names of wheels and modes. Other joints that are gone have been locked.
     removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
     return replace(
         robot,
@@ -115,7 +117,7 @@ def equipped(
 
 
 def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
-    """Remove keys that match only removed joints, from a mapping and its nested mappings."""
+    """Return a mapping without keys that match only removed joints, also in nested mappings."""
     removed, others = ([f"{of}.{x}" for of in _GROUPS for x in names] for names in (gone, left))
     return {
         key: _without(value, gone, left) if isinstance(value, Mapping) else value
@@ -125,7 +127,7 @@ def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict
 
 
 def with_appendages(robot: Robot, appendages: object) -> Robot:
-    """Return a robot with other flexible appendages and slosh, whose modes are joints."""
+    """Return a robot with other appendages (flexible or slosh), whose modes become joints."""
     given = [appendages] if isinstance(appendages, Appendage) else appendages
     if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
         raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
@@ -140,7 +142,8 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
                 "rigid=True for only one appendage of each body"
             )
         taken.add(joint)
-        # The link has the inertia from the appendage's file in place of its own.
+        # The inertia from the appendage's file replaces the inertia of the link. It replaces the
+        # whole body if the frame is not a link.
         of_file, body, links = rigid_inertia(item.inertia), bare.model.inertias[joint], bare.links
         own = as_inertia(bare.pieces[item.frame]) if item.frame in bare.pieces else body
         if item.frame in links:
@@ -156,10 +159,11 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 
 
 class Mounted(NamedTuple):
-    """A mounted body, and the joint on which it moves relative to its carrier.
+    """Body that is mounted on a carrier, and the joint between body and carrier.
 
     `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
-    is the joint's placement in the carrier's frame. `inertia` is the body in the joint's frame.
+    is the joint's placement in the carrier's frame. `inertia` is the body's inertia in the joint's
+    frame.
     """
 
     joint: Joint
@@ -176,14 +180,14 @@ class Mounted(NamedTuple):
 
 
 def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
-    """Return a model with a new joint for each part, and with new inertias of the old bodies.
+    """Return a model with a new joint for each part; `bodies` replace the old inertias.
 
     The new joints come after all other joints that their carrier carries.
     """
     new, names = with_marked_frames(model)
     for part in parts:
         on = part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
-        # Models built in code may lack frames of their joints.
+        # A model that was built in code may lack the frame of a joint.
         if not new.existFrame(on, pin.FrameType.JOINT):
             new.addJointFrame(new.getJointId(on))
         alone = pin.Model()
@@ -203,10 +207,10 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
 
 
 def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dict[str, str]]:
-    """Return a copy whose frames, except those of joints, have marks for names; and {mark: name}.
+    """Return a copy of a model whose frames are renamed to unique marks, and {mark: name}.
 
-    Pinocchio finds frames by name when it joins or reduces models, but a link and a joint may share
-    a name.
+    Joint frames keep their names. When Pinocchio joins or reduces models, it finds frames by name,
+    but a link and a joint may share a name.
     """
     marked, names = model.copy(), dict[str, str]()
     for index, frame in enumerate(marked.frames):
@@ -216,13 +220,13 @@ def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dic
 
 
 def restore_names(model: pin.Model, names: Mapping[str, str]) -> None:
-    """Give the frames with marks their names again."""
+    """Replace the marks of frames by the original names."""
     for frame in model.frames:
         frame.name = names.get(frame.name, frame.name)
 
 
 def carry_over(model: pin.Model, new: pin.Model) -> None:
-    """Copy the arrays of joints that `appendModel` leaves out from a model to the new model."""
+    """Copy armatures and lower velocity limits to `new`, because `appendModel` omits them."""
     for name in ("armature", "lowerVelocityLimit"):
         values, old = getattr(new, name).copy(), getattr(model, name)
         for index in range(ROOT, model.njoints):
@@ -232,15 +236,15 @@ def carry_over(model: pin.Model, new: pin.Model) -> None:
 
 
 def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
-    """Return the joint that carries a wheel, and its axis (3,) in that joint's frame."""
+    """Return the joint that carries a wheel, and the wheel's axis (3,) in the joint's frame."""
     joint, placement = find_frame(model, wheel.frame)
     return joint, placement.rotation @ np.array(wheel.axis)
 
 
 def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
-    """Angular momentum stored in the wheels without inertia, by the joint that carries them.
+    """Return the angular momentum in wheels without inertia, summed for each carrying joint.
 
-    Each entry is the joint index and the vector (3,) [N m s] in joint axes.
+    Each entry is the index of the joint, and the momentum (3,) [N m s] in the axes of the joint.
     """
     stored: dict[int, Array] = {}
     for _, wheel in named_wheels(robot.inputs):
@@ -253,7 +257,7 @@ def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
 def _mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return the wheels that have an inertia, and subtract each from the body that includes it."""
+    """Return the wheels that have an inertia, and subtract each from the body that carries it."""
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
@@ -263,7 +267,7 @@ def _mounted_wheels(
         rest = bodies[joint] - spinning
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # If the link is the wheel itself, only rounding errors of its inertia remain.
+        # If the link is the wheel itself, the difference of the inertias is only a rounding error.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
@@ -286,16 +290,16 @@ def _carrier_name(model: pin.Model, joint: int) -> str:
 
 
 def turned_to(axis: Array) -> Array:
-    """Return a rotation (3, 3) that maps z to an axis, exact for x, y and z."""
+    """Return a rotation (3, 3) that maps z to an axis; it is exact for the axes x, y and z."""
     beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     beside /= np.linalg.norm(beside)
     return np.column_stack((beside, np.cross(axis, beside), axis))
 
 
 def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
-    """Return the joint that carries an appendage, its placement and its participation L (6, k).
+    """Return an appendage's carrying joint, placement and participation L (6, k).
 
-    The placement and L are in the frame of the carrying body, and L is about the body's origin.
+    The placement and L are in the frame of the carrying body. L is about the body's origin.
     """
     joint, placement = find_frame(model, item.frame)
     return joint, placement, placement.toDualActionMatrix() @ item.participation
@@ -304,7 +308,7 @@ def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
 def _mounted_modes(
     bare: Robot, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
-    """Return the bodies of all modes, and subtract them from the bodies that carry them."""
+    """Return mounted bodies for all modes, and subtract them from the bodies that carry them."""
     model, parts = bare.model, list[Mounted]()
     of_body: dict[int, list[tuple[Appendage, pin.SE3, Array]]] = {}
     for item in appendages:
@@ -354,10 +358,10 @@ def _mounted_modes(
 
 
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
-    """Return {mode: effective masses and moments of inertia (6,)} in the appendage's frame.
+    """Return {mode: effective masses and moments of inertia (6,)} along the frame's axes.
 
-    The values are fractions of the rigid inertia about the frame's origin. This is the inertia of
-    the appendage's file, or without one, the inertia of the body that carries the appendage.
+    The values are fractions of the rigid inertia about the origin of the appendage's frame. The
+    rigid inertia is from the appendage's file, or otherwise from the body that carries it.
     """
     found: dict[str, Array] = {}
     for item in appendages:
@@ -373,7 +377,7 @@ def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[
 def _compare_inertia(
     appendage: Appendage, placement: pin.SE3, body: pin.Inertia, bare: Robot
 ) -> None:
-    """Warn if a file's rigid inertia differs from the link's."""
+    """Warn if the rigid inertia in an appendage's file differs from the inertia of the link."""
     if not isinstance(appendage, FlexibleAppendage) or appendage.inertia is None:
         return
     what = f"the body with frame '{appendage.frame}'"
@@ -405,11 +409,11 @@ def _radius_of_gyration(body: pin.Inertia) -> float:
 
 
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
-    """Return the least eigenvalue (N,) of M_rr - L L^T, relative to the largest one of M_rr.
+    """Return the least eigenvalue (N,) of M_rr - L L^T over the largest eigenvalue of M_rr.
 
     M_rr follows from masses (N,), centres of mass (N, 3), and inertias (N, 3, 3) about them.
     """
-    # M_rr is scaled: about the centre of mass, with unit mass and unit radius of gyration.
+    # M_rr is about the centre of mass, with lengths in units of the radius of gyration.
     trace = np.trace(inertia, axis1=1, axis2=2)
     size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
     t, r = np.split(L, 2)
@@ -431,10 +435,10 @@ def first_impossible(
     appendages: Sequence[Appendage],
     bodies: Mapping[int, tuple[Array, Array, Array]],
 ) -> int | None:
-    """Return the first of N rows in which modes need more inertia than their body has.
+    """Return the index of the first row in which modes need more inertia than their body has.
 
     `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
-    Return None if all rows are possible.
+    The result is None if all N rows are possible.
     """
     found = [_carried(model, item) for item in appendages]
     impossible = []
@@ -450,15 +454,15 @@ def _ball(
 ) -> Mounted:
     """Return the ball of a mode with the participation `column` (6,) about its body's origin.
 
-    p (3,) is the origin of the appendage's frame. The ball has the fraction `lighter` of the mass
-    with which it needs no rotor.
+    `p` (3,) is the origin of the appendage's frame. `lighter` is the ball's mass as a fraction of
+    the mass with which its joint needs no rotor inertia.
     """
-    # Refer participation to the appendage's frame: only there, a pure translation has r = 0.
+    # Refer the participation to the appendage's frame. Only there, a pure translation has r = 0.
     t, r, size = column[:3], column[3:] - np.cross(p, column[:3]), _radius_of_gyration(body)
     square, center = float(t @ t), np.zeros(3)
     if math.sqrt(square) * size > _NONE * math.hypot(*r):
         center = np.cross(t, r) / square
-        # Limit the ball's distance to the body's radius of gyration.
+        # The ball's distance from the frame is at most the body's radius of gyration.
         center *= min(1.0, size / max(math.hypot(*center), 1e-300))
     else:
         t, square = np.zeros(3), 0.0
@@ -468,8 +472,9 @@ def _ball(
         r, rest = np.zeros(3), 0.0
     moment = rest**2 + size**2 * square if rest else 0.0
     mass = square + (rest / size) ** 2 if square else 0.0
-    # Per unit of the amplitude, the ball rotates by w and moves by v. It is at the distance c
-    # from the appendage's frame. The rotation of the structure is at most |w| + |v| / |c|.
+    # Per unit amplitude, the ball rotates by |w| = rest / moment and moves by |v| = |t| / mass. It
+    # is at the distance `lever` from the appendage's frame. So the structure rotates by at most
+    # |w| + |v| / lever.
     rotation = rest / moment if moment else 0.0
     if mass and lever >= _SHORTEST * size:
         rotation += math.sqrt(square) / mass / lever
@@ -483,7 +488,8 @@ def _ball(
     else:
         axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
         origin, motion = center, pin.JointModelPZ()
-    # The inertia of a rotor compensates a different mass of the ball: S^T I S + rotor = 1.
+    # A lighter ball has S^T I S > 1. A negative rotor inertia restores the modal mass of 1:
+    # S^T I S + rotor = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
@@ -492,10 +498,10 @@ def _ball(
 
 
 def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
-    """Return a slosh mass as two joints, the second with the mass."""
+    """Return a slosh mass as two joints in series; the second joint carries the mass."""
     x, y, z = (placement.rotation @ slosh.axes).T
-    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, and so also
-    # moves along x and y.
+    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, so positive
+    # angles also move the mass along x and y.
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))

@@ -1,4 +1,4 @@
-"""Craig-Bampton superelements of Nastran, with modes that are clamped at a rigid interface."""
+"""Reader of Nastran's Craig-Bampton superelements, whose modes are clamped at an interface."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,20 +22,23 @@ MASSES = {
 # Names that different programs give to the mass and stiffness matrices.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest rounding error, relative to the largest entry of a matrix. If the asymmetry, the
-# stiffness that couples boundary and modes, or the stiffness of the rigid interface is larger, the
-# file is refused.
+# Largest rounding error, relative to the largest entry of a matrix. A file is refused if a larger
+# entry makes a matrix asymmetric, couples boundary and modes, or resists a rigid motion.
 _SHARE = 1e-6
 
 
 def read_superelement(
     op4: object, asm: object, *, origin: object, modes: int | None, length: str, mass: str
 ) -> tuple[Array, Array, Array]:
-    """Return the modes of a superelement, see `FlexibleAppendage.from_nastran`.
+    """Return (frequencies, L, M_rr) of a superelement; see `FlexibleAppendage.from_nastran`.
 
-    In SI units and the axes of Nastran's basic frame, these are the frequencies (k,) [Hz], the
-    participation L (6, k) with translation [kg^0.5] before rotation [kg^0.5 m], and the rigid
-    inertia M_rr (6, 6). L and M_rr are about the origin of the interface.
+    The values are in SI units and in the axes of Nastran's basic frame:
+
+    - the frequencies (k,) [Hz];
+    - the participation L (6, k), first in translation [kg^0.5], then in rotation [kg^0.5 m];
+    - the rigid inertia M_rr (6, 6).
+
+    L and M_rr are about the origin of the interface.
     """
     from scipy.linalg import LinAlgError, eigh
 
@@ -61,7 +64,7 @@ def read_superelement(
         squares, shapes = eigh(K[np.ix_(inner, inner)], M[np.ix_(inner, inner)])
     except LinAlgError:
         squares = np.zeros(1)
-    # The structure must be clamped only at the boundary.
+    # The modes must be independent, and the structure must be clamped only at the boundary.
     faults = {
         "the stiffness matrix couples boundary and modes; expected modes that are clamped at the "
         "boundary (Craig-Bampton)": np.abs(coupling).max() > _SHARE * np.abs(K).max(),
@@ -97,13 +100,16 @@ def _read_as(path: Path, kind: str) -> Iterator[None]:
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return the mask of boundary degrees of freedom, all rigid motions, and the grid points."""
+    """Return the mask and the rigid motions of the degrees of freedom, and the grid positions.
+
+    The mask is true for the degrees of freedom of the boundary.
+    """
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file() and "pv_only"
     with _read_as(path, "the assembly file (.asm) of an external superelement"):
         with np.printoptions():  # pyYeti changes them for the whole process
             from pyyeti import nastran
-        # A .pch file lists the degrees of freedom that each grid point retains; without the file
-        # it retains all six.
+        # A .pch file lists the degrees of freedom that each grid point retains. Without this file,
+        # each grid point retains all six.
         uset, _, found, *kept = nastran.asm2uset(str(path), try_rdextrn=punched)
         rigid = np.asarray(nastran.rbgeom_uset(uset))
         points = uset.loc[(slice(None), 1), "x":"z"].values.astype(float)

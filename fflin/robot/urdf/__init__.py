@@ -1,4 +1,5 @@
 """Reader that turns the text of a URDF into a checked Pinocchio model.
 
-It handles XML, xacro, links, joints, the tree, mimic joints and inertias. Imports only `base`.
+It parses XML, expands xacro, and checks links, joints, the tree, mimic joints and inertias. It
+imports only `base`.
 """

@@ -1,4 +1,4 @@
-"""Checked content of a URDF: links with their inertias, joints, mimic joints, and their tree."""
+"""Checks of a URDF's content: links, inertias, joints, mimic joints and the tree."""
 
 import math
 import sys
@@ -18,30 +18,31 @@ FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floatin
 # Value of a missing limit in the model.
 UNLIMITED = sys.float_info.max
 
-# If a length is 1e8 m, adding 1 m^2 to its square changes nothing in double precision. The links'
-# moments about their own joints would be lost, and ABA would divide zero by zero.
+# For a length of 1e8 m, adding 1 m^2 to its square changes nothing in double precision. The moments
+# of inertia of the links would be lost, and ABA would divide zero by zero.
 _FARTHEST = 1e7  # [m]
 
-# Tolerance of a quaternion's length: files often have four digits, seldom fewer.
+# Tolerance of a quaternion's length, because many files give only four digits.
 _QUATERNION_SLACK = 1e-3
 
 # An axis whose length is outside these bounds is an error in the file.
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
-# A singular inertia has eigenvalues of about -1e-16 of the largest, because its six numbers are
-# rounded. The tolerance is larger because CAD programs write fewer digits.
+# Rounding can change a zero eigenvalue of an inertia to -1e-16 times the largest eigenvalue. The
+# tolerance is larger, because CAD programs write fewer digits.
 _NEGATIVE_SLACK = 1e-9
 
-# CAD programs give a point mass an inertia that is only a rounding error of either sign. It is no
-# larger than if the body extended this far from its centre.
+# CAD programs may give a point mass a small inertia of either sign, which is only a rounding error.
+# Such an inertia is at most mass times the square of this length.
 _POINT = 1e-6  # [m]
 
-# A negative moment is accepted below this fraction of the whole rigid body's moment. It changes M
-# by less than the rounding of published numbers does.
+# A negative moment of a link is accepted if its magnitude is at most this fraction of the least
+# moment of the rigid body of all links fixed to it. It then changes M by less than the rounding of
+# published numbers does.
 _LOST_IN_BODY = 1e-6
 
-# Tolerance of the triangle inequality of principal moments. A flat plate fulfils it with equality,
-# and published numbers have three digits or more.
+# Relative tolerance by which a principal moment may exceed the sum of the other two. Both are equal
+# for a flat plate, and published numbers may have only three digits.
 TRIANGLE_SLACK = 1e-3
 
 # urdfdom and Pinocchio's parser recurse along the tree, and take about 2.5 kB of stack per link.
@@ -50,7 +51,7 @@ _DEPTH_LIMIT = 1_000
 # Most robots have fewer than 100 links. The limit bounds computing time and memory.
 _LINK_LIMIT = 10_000
 
-# Entries of an inertia in the order of URDF.
+# Attributes of <inertia>, in the order in which `Link.inertia` stores them.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -63,14 +64,14 @@ class Pose(NamedTuple):
 
     @property
     def placement(self) -> pin.SE3:
-        """The same placement for Pinocchio."""
+        """Placement as a Pinocchio object."""
         if self.quaternion is not None:
             return pin.XYZQUATToSE3(np.array([*self.xyz, *self.quaternion]))
         return pin.SE3(pin.rpy.rpyToMatrix(*self.rpy), np.array(self.xyz))
 
 
 class Link(NamedTuple):
-    """One link, and the element that describes it."""
+    """Link of a URDF, and its XML element."""
 
     name: str
     element: Element
@@ -86,7 +87,7 @@ class Link(NamedTuple):
 
 
 class Mimic(NamedTuple):
-    """A joint that moves with another: value = multiplier * leader's value + offset."""
+    """Rule of a mimic joint, whose position is ``multiplier * leader's position + offset``."""
 
     leader: str
     multiplier: float  # [rad/rad, m/rad, ...]
@@ -94,7 +95,7 @@ class Mimic(NamedTuple):
 
 
 class JointElement(NamedTuple):
-    """One joint between two links, and the element that describes it."""
+    """Joint of a URDF between two links, and its XML element."""
 
     name: str
     element: Element
@@ -132,7 +133,7 @@ def read_link(element: Element) -> Link:
 
 
 def read_pose(element: Element) -> Pose:
-    """Read the <origin> of an element, or return the identity without one."""
+    """Read the <origin> of an element; return the identity if the element has none."""
     origin = element.find("origin", "xyz", "rpy", "quat_xyzw")
     if origin is None:
         return Pose()
@@ -170,7 +171,7 @@ def read_joint(element: Element) -> JointElement:
         numbers = found.number("multiplier", 1.0), found.number("offset", 0.0)
         mimic = Mimic(found.text("joint"), *numbers)
     joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
-    # Fixed joints need no axis, and exporters write zeros for it.
+    # Only a joint with one degree of freedom needs an axis. Exporters write zeros for others.
     if FREEDOM[kind] != 1:
         return joint
     if found := element.find("axis", "xyz"):
@@ -194,7 +195,7 @@ def read_joint(element: Element) -> JointElement:
 
 
 def _limits(found: Element) -> dict[str, float]:
-    """Return the valid limits; others cause only a note, because models do not depend on limits."""
+    """Return the valid limits; an invalid one causes only a note, because A and B ignore limits."""
     limits: dict[str, float] = {}
     for name in ("lower", "upper", "effort", "velocity"):
         if name not in found.attributes:
@@ -218,7 +219,7 @@ def _limits(found: Element) -> dict[str, float]:
 
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
-    """Return {mimic joint: Mimic of an independent joint}, without fixed joints."""
+    """Return {mimic joint: its rule relative to an independent joint}; omit fixed joints."""
     written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
     resolved: dict[str, Mimic] = {}
     for name in written:
@@ -258,8 +259,8 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     root.refuse_near_miss("link", "joint")
-    # Extensions of URDF have elements with these names too, but with other children. So nested
-    # elements are recognised by their children.
+    # Extensions of URDF have elements with the same names but other children. So a misplaced link
+    # or joint is recognised by its children.
     marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
     for child in root.children:
         for inner in (child, *child.iterate()):
@@ -338,15 +339,19 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
-    """Return whether any of the sorted principal moments [kg m^2] is negative beyond rounding."""
-    # A body within the radius r of its centre has moments of at most mass r^2.
+    """Return whether a principal moment [kg m^2] is too negative to be a rounding error.
+
+    The moments are sorted.
+    """
+    # A body within the radius r of its centre has moments of at most mass * r^2.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
     """Return notes about unusual inertias.
 
-    Raise an error for a negative moment that is not negligible beside the fixed links.
+    Raise `UrdfError` for a negative principal moment, unless it is negligible compared with the
+    moments of the rigid body that contains the link.
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
@@ -367,7 +372,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
-        # Note a principal moment that is larger than the sum of the other two.
+        # The largest principal moment exceeds the sum of the other two.
         (unequal, f"unphysical inertia: {enumerated(unequal)}"),
         (weightless, f"inertia without mass: {named('link', weightless)}"),
     )

@@ -29,8 +29,8 @@ from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 SIZE_LIMIT = 64 * 2**20  # bytes
 
-# Stack of the thread in which urdfdom and Pinocchio recurse along the tree. The usual stack of a
-# thread may have only 512 kB.
+# Stack size [bytes] of the thread in which urdfdom and Pinocchio recurse along the tree. The usual
+# stack of a thread may have only 512 kB.
 _STACK = 16 * 2**20
 
 _UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
@@ -38,7 +38,7 @@ _UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
 # Characters that must be escaped in values of attributes.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
-# Time limit of an expansion [s], since xacro's expressions and macros may not terminate.
+# Time limit [s] of an expansion, because expressions and macros in xacro may never end.
 XACRO_LIMIT = 60.0
 
 # Path of the program that expands xacro. It is run as a file, because with -m or -c it could import
@@ -74,8 +74,8 @@ def describe(document: bytes, path: Path) -> Urdf:
     root, notes = plain_root(document, path)
     links, joints = read_tree(root)
     mimics = resolve_mimics(joints)
-    # The joint model of a continuous joint does not count turns. Leaders count them if a full turn
-    # leaves a mimic joint displaced.
+    # A continuous joint does not count full turns. A leader must count them if its full turn
+    # displaces a mimic joint.
     counted = {
         mimic.leader
         for name, mimic in mimics.items()
@@ -119,13 +119,13 @@ def describe(document: bytes, path: Path) -> Urdf:
 def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
     """Parse a document, expanding any xacro in it; return its root and the messages of xacro."""
     root = parse(document, str(path))
-    # Search for text that indicates xacro, or for characters that may encode such text.
+    # Search first for text that may indicate xacro, or for "&#", which may encode such text.
     text = document.replace(b"\0", b"")  # so that UTF-16 is searched too
     first = None
     if any(x in text for x in (b"xacro:", b"$", b"&#")):
         for element in chain([root], root.iterate(_IGNORED)):
             marked = any("${" in x or "$(" in x for x in element.attributes.values())
-            # Declaring the prefix is not a use.
+            # A declaration of the prefix xacro is an attribute, and does not use xacro.
             if marked or element.tag.startswith("xacro:"):
                 first = element
                 break
@@ -138,10 +138,9 @@ def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
 def ignored(
     joints: Mapping[str, JointElement], origin: str
 ) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """Yield warnings about dampers, friction and zero limits that the model ignores.
+    """Yield (field, joints, warning) for damping, friction and zero limits that fflin ignores.
 
-    Each warning comes after the name of a field of the robot and the names of joints. The warning
-    is unnecessary if this field names all of these joints.
+    The warning is unnecessary if this field of the robot names all of these joints.
     """
     moving = [joint for joint in joints.values() if joint.freedom]
     for field, effect in (("damping", "damping"), ("friction", "Coulomb friction")):
@@ -164,9 +163,9 @@ def write_urdf(
     joints: Mapping[str, JointElement],
     counted: Collection[str],
 ) -> str:
-    """Return a URDF of links, inertias and joints with exact numbers.
+    """Return a URDF of links and joints, with numbers in full precision.
 
-    `counted` continuous joints become revolute, so that they count full turns.
+    Continuous joints in `counted` become revolute joints, because these count full turns.
     """
     parts = []
     for link in links.values():
@@ -186,7 +185,7 @@ def write_urdf(
         if kind in ("revolute", "prismatic") or joint.limits:
             inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
         parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
-    # Version 1.1 is the first for which urdfdom reads quat_xyzw; 1.2 would require limits.
+    # urdfdom reads quat_xyzw only from version 1.1 on, and version 1.2 would require limits.
     return _tag("robot", {"name": name, "version": "1.1"}, "\n".join(parts))
 
 
@@ -197,7 +196,7 @@ def _origin(pose: Pose) -> str:
 
 
 def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:
-    """Return an element; the standard library's functions would load many modules."""
+    """Return an XML element; the functions of the standard library would load many modules."""
     text = f"<{tag}"
     for name, value in attributes.items():
         shown = " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)

@@ -1,4 +1,4 @@
-"""Program that expands one xacro document. It runs as a file, isolated, without the package fflin.
+"""Program that expands one xacro document in an isolated process that does not import fflin.
 
 Its arguments are the path of the document, the time limit [s], and the folders from which to
 import. Until it has set these folders, it imports only built-in modules.
@@ -8,7 +8,7 @@ import sys
 
 
 def main(path: str, limit: float) -> None:
-    """Expand stdin; write to stdout the list of files read, as a line of JSON, and the URDF."""
+    """Expand a document from stdin; write a JSON line of included files, then the URDF."""
     import contextlib
     import faulthandler
     import json
@@ -22,14 +22,14 @@ def main(path: str, limit: float) -> None:
     try:
         with contextlib.redirect_stdout(sys.stderr):
             packages.walk_up_from(path)
-            # xacro searches included files relative to the file on top of its stack.
+            # xacro searches for included files relative to the file on top of its stack.
             xacro.init_stacks(path)
             urdf = XacroDoc.from_string(
                 document, resolve_packages=False, rootdir=Path(path).parent
             ).to_urdf_string()
     except Exception as error:  # xacro evaluates Python expressions, which may raise anything
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
-    # Included documents and YAML files, without duplicates.
+    # The list contains included documents and YAML files, each once.
     files = json.dumps(sorted(set(xacro.all_includes)))
     sys.stdout.buffer.write(f"{files}\n{urdf}".encode())
 

@@ -22,8 +22,8 @@ _TAG_LIMIT = 2**20  # bytes
 # No physical value is larger than this, and the product of two such numbers does not overflow.
 _LARGEST = 1e30
 
-# Least similarity at which a name counts as misspelt. For example, xzy is near to xyz, and quat to
-# quat_xyzw, but unit is not near to value.
+# Least similarity at which an unknown name counts as misspelt. For example, "xzy" is similar to
+# "xyz", and "quat" to "quat_xyzw", but "unit" is not similar to "value".
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
@@ -34,7 +34,7 @@ _DECIMAL = re.compile(
 
 @lru_cache(128)  # a file repeats a few names many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
-    """Return the known name nearest to a name, or None if no name is near."""
+    """Return the known name most similar to a name, or None if no name is similar enough."""
     import difflib
 
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
@@ -65,7 +65,7 @@ class Element:
         return UrdfError(f"{self.origin}:{self.line}: {message}")
 
     def note(self, message: str) -> None:
-        """Add a warning about this element; equal warnings appear once, with all line numbers."""
+        """Add a warning about this element; a repeated warning appears once, with a count."""
         self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
@@ -73,10 +73,10 @@ class Element:
         return [child for child in self.children if child.tag == tag]
 
     def find(self, tag: str, *attributes: str) -> Element | None:
-        """Return the only child with a tag, or None.
+        """Return the only child with a tag, or None; raise `UrdfError` for a second child.
 
-        If `attributes` are given, the child may have no others: a misspelt attribute is an error,
-        and any other unknown attribute causes a note.
+        If `attributes` are given, they are the known attributes of the child. A misspelt attribute
+        raises `UrdfError`, and any other unknown attribute causes a note.
         """
         found = self.find_all(tag)
         if len(found) > 1:
@@ -99,14 +99,14 @@ class Element:
         return found[0] if found else None
 
     def require(self, tag: str, *attributes: str) -> Element:
-        """Return the only child with a tag as `find` does, or raise `UrdfError` without one."""
+        """Return the child that `find` returns, or raise `UrdfError` if there is none."""
         found = self.find(tag, *attributes)
         if found is None:
             raise self.error(f"{self.title} has no <{tag}>; add it")
         return found
 
     def refuse_near_miss(self, *known: str) -> None:
-        """Raise `UrdfError` for misspelt known children; other unknown children are ignored."""
+        """Raise `UrdfError` if a child's tag is a misspelt known tag; ignore other unknown tags."""
         for child in self.children:
             near = child.tag not in known and ":" not in child.tag
             if near and (meant := nearest(child.tag.lower(), known, 0.85)):
@@ -115,7 +115,7 @@ class Element:
                 )
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
-        """Yield all elements below this element in document order, except skipped subtrees."""
+        """Yield all elements below this element in document order, except the subtrees `skip`."""
         for child in self.children:
             if child.tag not in skip:
                 yield child
@@ -130,13 +130,13 @@ class Element:
         return value
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Return an attribute as a decimal number of at most 1e30."""
+        """Return an attribute as a decimal number with a magnitude of at most 1e30."""
         if default is not None and name not in self.attributes:
             return default
         return self.vector(name, 1)[0]
 
     def vector(self, name: str, size: int) -> tuple[float, ...]:
-        """Return an attribute as `size` decimal numbers of at most 1e30."""
+        """Return an attribute as `size` decimal numbers with magnitudes of at most 1e30."""
         text = self.text(name)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
         values = tuple(map(decimal, entries))
@@ -163,7 +163,7 @@ def quoted(text: str) -> str:
 
 
 def enumerated(names: Iterable[str]) -> str:
-    """Return a list of names for a sentence: the first six, and the number of the others."""
+    """Join quoted names for a sentence: give the first six, and count the others."""
     return listed(map(quoted, names))
 
 
@@ -184,7 +184,7 @@ def notes_of(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Parse a document in its declared encoding, and return its root; refuse entities."""
+    """Parse a document in its declared encoding, and return its root; refuse <!DOCTYPE>."""
     top = Element("", {}, 0, origin)
     opened, count, parser = [top], 0, expat.ParserCreate()
 
@@ -202,7 +202,7 @@ def parse(document: bytes, origin: str) -> Element:
         opened.append(element)
 
     def refuse_document_type(*_: object) -> None:
-        # A document type may declare entities, which may be external or have any length.
+        # A document type can declare entities, which can read other files or expand to any length.
         raise UrdfError(
             f"{origin}:{parser.CurrentLineNumber}: document types (<!DOCTYPE>) and entities are "
             "not supported; remove the declaration and replace each entity by its text"
