@@ -23,13 +23,13 @@ _SUSPICIOUS = 1e-3
 # defective. A defective pole has too few eigenvectors for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# The Rayleigh quotient of a singular vector refines a pole and converges quadratically, in few
-# steps. Refining a second-order pole may take twice as many steps, each smaller than _NEAR times
-# the pole.
+# The Rayleigh quotient of a singular vector refines a pole. It converges quadratically, so
+# _REFINEMENTS steps are enough. A second-order pole is refined in at most twice as many steps. Its
+# refinement stops if a step is larger than _NEAR times the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
-# Two poles are aliased if sampling brings them closer than this. A state that is observable in the
-# continuous model may then be unobservable in the sampled one.
+# Two poles are aliased if they are apart but sampling brings them closer than this. A state that is
+# observable in the continuous model may then be unobservable in the sampled one.
 _ALIASED = 1e-6
 
 # A pole whose decay rate is below this may belong to a defective pair at zero, because rounding
@@ -45,9 +45,9 @@ def split_by_poles(
 ) -> tuple[Array, Array, Array, ranks.FixedPoles]:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
 
-    Return a basis (nx, d) of the controllable subspace, its complement (nx, nx - d), which is the
-    unobservable subspace of a dual pair, rows (nx - d, nx) on which no input acts, and the fixed
-    poles.
+    Return four results: a basis (nx, d) of the controllable subspace; its complement (nx, nx - d);
+    rows (nx - d, nx) on which no input acts; and the fixed poles. For a dual pair, the complement
+    is the unobservable subspace.
     """
     # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
     # The states are scaled to units of energy, x = to_x xi. Velocities are scaled to L^T nu with
@@ -154,10 +154,11 @@ def unobservable(
 ) -> tuple[Array, tuple[tuple[complex, Values], ...], ranks.FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
-    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The
-    result is a basis (2 nv, k) of them, as (s, ds/dt), each nonzero pole or pair of the continuous
-    model with its shapes (nv, m), and the fixed poles. It is None if this test is inconclusive: K
-    or D is not symmetric, D is indefinite, sampling aliases two poles, or a pole is defective.
+    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. Return
+    three results: a basis (2 nv, k) of these motions (s, ds/dt); the nonzero poles of the
+    continuous model, one of each conjugate pair, with their shapes (nv, m); and the fixed poles.
+    Return None if the test is inconclusive, because K or D is not symmetric, D is indefinite,
+    sampling aliases two poles, or a pole is defective.
     """
     # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
     # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.

@@ -21,11 +21,12 @@ _SYMMETRIC = 1e-8
 # because the operating point is in motion.
 _CONSISTENT = 1e-8
 
-# Rounding error of springs per squared spin rate and of dampers per spin rate, in units of energy.
+# Rounding error in units of energy: for springs, it is multiplied by the squared spin rate; for
+# dampers, by the spin rate.
 _OF_SPIN = 1e-15
 
-# If the orbital rate, relative to the fastest vibration, is below this, the square of the ratio is
-# close to rounding error.
+# Orbital effects depend on the square of the orbital rate divided by the fastest vibration rate. If
+# this ratio is below _SLOWEST, its square is close to rounding error.
 _SLOWEST = 3e-6
 
 
@@ -161,7 +162,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return `lin` or its continuous model if that model is a second-order system, else None."""
+    """Return the continuous model, or `lin` if there is none, if it is a second-order system."""
     # The continuous model has this structure if the rates of the positions depend on the
     # velocities alone. The structure then also applies to a model sampled from it. A sampled model
     # without its continuous model has this structure only if there are no forces.

@@ -153,7 +153,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> Impact:
-    """Join robots at (q, v) to one robot (13.1); the impulses are generalised ones of the parts."""
+    """Join robots at (q, v) to one robot (13.1); return generalised impulses on the parts."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))

@@ -15,12 +15,12 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
-# grows as 1 / (M^-1)_ii, the inertia of i while all other coordinates are free, becomes small
-# relative to M_ii. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine
-# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
-# smaller sum than the number of coordinates shows that some pivots are only rounding errors.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. 1 /
+# (M^-1)_ii is the inertia of i if all other coordinates are free. The smaller this inertia is
+# relative to M_ii, the larger is the coupling. Coupling times machine epsilon is the relative error
+# of (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine
+# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum
+# below the number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
@@ -41,7 +41,7 @@ _crba, _compute_inverse, _cholesky = pin.crba, pin.computeMinverse, pin.cholesky
 
 
 class Inertia:
-    """M^-1 at a configuration, in base axes: angular, linear, joints."""
+    """M^-1 at a configuration, in base axes and state order."""
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
@@ -133,7 +133,7 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     """Return upper bounds of the mass or moment of inertia that each coordinate moves."""
     # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
     # largest principal moment, and its mass times the squared length of the path to it. The path
-    # runs from joint to joint, with prismatic joints within `STROKE`.
+    # runs from joint to joint, and includes a displacement of `STROKE` at each prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
     if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
@@ -282,10 +282,10 @@ class Accelerations:
     ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
         r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
 
-        They are added to the wrenches of the inputs on every joint, and returned as a generalised
-        force (nv,) with its derivatives (nv, nv) over q and v. In the derivative over q the
-        Jacobian is constant, because RNEA's derivatives with these wrenches already include the
-        change of the Jacobian.
+        Return four results: the wrenches on all joints, with the gyroscopic torques added; the
+        torques as a generalised force (nv,); and its derivatives (nv, nv) over q and over v. In the
+        derivative over q the Jacobian is constant, because RNEA's derivatives with these wrenches
+        already include the change of the Jacobian.
         """
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in its axes, the torque h x omega is the

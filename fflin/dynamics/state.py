@@ -1,4 +1,4 @@
-"""State X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart; and inputs."""
+"""State x = (q_b, r_b, q_m, omega_b, v_b, qdot_m), its frames and chart, and the inputs."""
 
 from __future__ import annotations
 
@@ -458,7 +458,7 @@ class Actuation:
         return chart.to_base(self.held, u[..., None])[..., 0]
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return each joint's wrench of thrusters and wheels in its frame; None without any."""
+        """Return the wrench of thrusters and wheels on each joint, in its frame, or None."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
