@@ -36,7 +36,8 @@ LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Decorate a function that is rarely called: it is not inlined, which would take long."""
+    """Decorate a rarely called function: it is not inlined, because inlining takes long to compile.
+    """
     HOW[function] = "called"
     return function
 
@@ -66,7 +67,7 @@ def load(array: Entries, index: int) -> Number:
 
 
 def store(array: Entries, index: int, value: Number) -> None:
-    """Write a number or lanes at an index."""
+    """Write one number, or one number per lane, at an index."""
     array[index] = value
 
 
@@ -117,18 +118,18 @@ def put3(work, at, a):
 
 
 def copy(source, first, target, to, count):
-    """Copy entries."""
+    """Copy `count` entries."""
     for index in range(count):
         store(target, to + index, load(source, first + index))
 
 
 def add(work, at, value):
-    """Add to an entry."""
+    """Add a value to an entry."""
     store(work, at, load(work, at) + value)
 
 
 def add3(work, at, a):
-    """Add to a vector."""
+    """Add a vector to three entries."""
     add(work, at, a[0])
     add(work, at + 1, a[1])
     add(work, at + 2, a[2])
@@ -146,7 +147,7 @@ def put6(work, at, s):
 
 
 def add6(work, at, s):
-    """Add to a spatial vector."""
+    """Add a spatial vector to six entries."""
     add3(work, at, s[0])
     add3(work, at + 3, s[1])
 
@@ -283,7 +284,7 @@ def columns_of(quaternion):
 
 
 def attitude(q, at=0):
-    """Return the base's quaternion at a configuration, which begins at an index."""
+    """Return the base's quaternion of the configuration that begins at the index `at`."""
     return get3(q, at + 3), load(q, at + 6)
 
 
