@@ -162,7 +162,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return the continuous model, or `lin` if there is none, if it is a second-order system."""
+    """Return the continuous model, or else `lin`; None if that is not a second-order system."""
     # The continuous model has this structure if the rates of the positions depend on the
     # velocities alone. The structure then also applies to a model sampled from it. A sampled model
     # without its continuous model has this structure only if there are no forces.

@@ -254,10 +254,10 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return two groups of wheels that do not affect the other states.
+    """Return two groups of wheels whose states do not affect the other states.
 
-    In the first group, the angle has no effect. In the second, neither angle nor speed has an
-    effect.
+    In the first group, the angle has no effect. The second group is the part of the first in which
+    the speed has no effect either.
     """
     # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
     # friction.

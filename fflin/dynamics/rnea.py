@@ -130,7 +130,10 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Return upper bounds of the mass or moment of inertia that each coordinate moves."""
+    """Return upper bounds of the mass or moment of inertia that each coordinate moves.
+
+    Return None if a joint is neither revolute nor prismatic.
+    """
     # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
     # largest principal moment, and its mass times the squared length of the path to it. The path
     # runs from joint to joint, and includes a displacement of `STROKE` at each prismatic joint.

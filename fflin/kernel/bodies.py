@@ -19,8 +19,8 @@ from fflin.kernel.vectors import load, splat, store
 # that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 # Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
-# the moment and force of its inertia, and the part of them that its own joints' c causes. The
-# moment and force exclude c until `accelerate_bodies` adds it.
+# moment and force (FORCE), and the moment and force that the accelerations c of the subtree's own
+# joints cause (CARRIED). FORCE excludes the effect of c until `accelerate_bodies` adds it.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 

@@ -117,7 +117,8 @@ def _operation(
 ) -> Callable[[Generator], Callable[..., object]]:
     """Decorate a function that generates the code which replaces a function of `kernel.vectors`.
 
-    The function gets the address of an array's first entry, which is a double or a vector.
+    In place of an array, the function gets the address of the array's first entry, which is a
+    double or a vector.
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:

@@ -298,7 +298,10 @@ def _tree(robot: Robot) -> Tree | None:
 
 
 def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, float] | None:
-    """Return a frame with z along a joint's axis; the joint's rotation and translation per unit."""
+    """Return a frame with z along a joint's axis, the joint's rotation and translation per unit.
+
+    Return None if the joint is not a screw about a constant axis.
+    """
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
     joint.calc(data, q)

@@ -36,8 +36,7 @@ LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Decorate a rarely called function: it is not inlined, because inlining takes long to compile.
-    """
+    """Decorate a rarely called function, which is not inlined to save compilation time."""
     HOW[function] = "called"
     return function
 
