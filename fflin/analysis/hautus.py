@@ -1,8 +1,8 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
 `split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B].
-`unobservable` tests second-order systems by the null space of [p^2 M + p D + K; C_s + p C_v], which
-is less sensitive to rounding.
+`unobservable` tests a second-order system by the null space of [p^2 M + p D + K; C_s + p C_v]. This
+test is less sensitive to rounding.
 """
 
 from operator import itemgetter
@@ -14,8 +14,9 @@ from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
 # A singular value above _SUSPICIOUS counts as nonzero. Singular values are computed only for
-# suspicious eigenvectors. An eigenvector is suspicious if its product with the unit input columns
-# is below _SUSPICIOUS, or if another eigenvalue is closer than _SUSPICIOUS to its eigenvalue.
+# suspicious eigenvectors. An eigenvector is suspicious in two cases: its product with the unit
+# input columns is below _SUSPICIOUS, or its eigenvalue is closer than _SUSPICIOUS to another
+# eigenvalue.
 _SUSPICIOUS = 1e-3
 
 # Eigenvalues closer than _SAME_POLE count as equal, because rounding moves a defective eigenvalue
@@ -32,8 +33,8 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # observable in the continuous model may then be unobservable in the sampled one.
 _ALIASED = 1e-6
 
-# A pole whose decay rate is below this may belong to a defective pair at zero, because rounding
-# moves such a pair by the square root of the rounding error.
+# A pole whose decay rate is below this may belong to a defective pair at zero. Rounding moves such
+# a pair by the square root of the rounding error.
 _DECAY = 1e-7
 
 # If one sample reduces a motion below this fraction, only its rounding error remains.

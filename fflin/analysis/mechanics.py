@@ -1,4 +1,4 @@
-"""A linear model as a mechanical system M a + D v + K s = S u, its conserved momenta, and names."""
+"""Linear models as mechanical systems M a + D v + K s = S u; conserved momenta and their names."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fflin.linear.model import LinearModel
 # Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
 _SYMMETRIC = 1e-8
 
-# If the relative residual of a momentum exceeds this, no coordinate has the momentum as its rate,
-# because the operating point is in motion.
+# If the relative residual of a momentum exceeds this, the operating point is in motion. The
+# momentum is then not the rate of any coordinate.
 _CONSISTENT = 1e-8
 
 # Rounding error in units of energy: for springs, it is multiplied by the squared spin rate; for

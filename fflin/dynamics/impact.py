@@ -1,4 +1,4 @@
-"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities just after."""
+"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities after them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -197,7 +197,7 @@ def inertia_at(robot: Robot, q: Array) -> Array:
 
 
 def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
-    """Return linear and angular momentum (6,) about the world's origin, in its axes."""
+    """Return (linear, angular) momentum (6,) about the world's origin, in world axes."""
     data = robot.create_data()
     pin.computeCentroidalMomentum(robot.model, data, q, v)
     linear, angular = data.hg.linear, data.hg.angular + np.cross(data.com[0], data.hg.linear)

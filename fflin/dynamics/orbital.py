@@ -172,16 +172,17 @@ class OrbitField:
         return R, origins[..., None] + R @ self._lever
 
 
-# Weights of the rotations about the radial direction, the direction of flight and the normal.
+# Weights, divided by n^2, of the rotations about the radial direction, the direction of flight and
+# the normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 
 
 class GravityGradient(NamedTuple):
     """Gravity-gradient field of an orbit at one base pose, in base axes.
 
-    A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x.
-    The field n^2 (3 r r^T - I) x is the sum of such terms for the radial direction, the direction
-    of flight and the normal, with the weights 2 n^2, -n^2 and -n^2.
+    A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x. The
+    field n^2 (3 r r^T - I) x is the sum of three such terms. Their weights are 2 n^2 for the radial
+    direction, -n^2 for the direction of flight and -n^2 for the normal.
     """
 
     turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation

@@ -71,9 +71,9 @@ class Inertia:
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self.centred(q)
-        # The articulated-body inverse is used only if `quick`, because its rounding errors would
-        # appear in entries of M^-1 K that should be exactly zero. The relative rounding errors of
-        # a Cholesky factor do not depend on the scaling of M.
+        # The articulated-body inverse is used only if `quick`. Its rounding errors would appear in
+        # entries of M^-1 K that should be exactly zero. The relative rounding errors of a Cholesky
+        # factor do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
@@ -134,8 +134,8 @@ def inertia_bounds(model: pin.Model) -> Array | None:
 
     Return None if a joint is neither revolute nor prismatic.
     """
-    # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
-    # largest principal moment, and its mass times the squared length of the path to it. The path
+    # The moment of inertia of a body about the base's origin has an upper bound. It is the body's
+    # largest principal moment, plus its mass times the squared length of the path to it. The path
     # runs from joint to joint, and includes a displacement of `STROKE` at each prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
@@ -199,9 +199,9 @@ class Accelerations:
         self._inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # Derivatives of M a + b - B u - springs over the displacements of the state, transposed so
-        # that the parts are contiguous. The first six rows, for attitude and position of the base,
-        # are zero without an orbit.
+        # Derivatives of M a + b - B u - springs over the displacements of the state. They are
+        # stored transposed, so that their parts are contiguous. The first six rows, for attitude
+        # and position of the base, are zero without an orbit.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
         self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
@@ -230,9 +230,10 @@ class Accelerations:
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # The base's placement and linear velocity are left out: in base axes c does not depend on
-        # them, and large values would cost Pinocchio's derivatives digits. Gravity is left out as
-        # well, because it accelerates all parts of the robot alike (equivalence principle).
+        # The base's placement and linear velocity are left out, because c does not depend on them
+        # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
+        # is left out as well, because it accelerates all parts of the robot alike (equivalence
+        # principle).
         q_still, v_still = self._inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
@@ -286,13 +287,13 @@ class Accelerations:
         r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
 
         Return four results: the wrenches on all joints, with the gyroscopic torques added; the
-        torques as a generalised force (nv,); and its derivatives (nv, nv) over q and over v. In the
-        derivative over q the Jacobian is constant, because RNEA's derivatives with these wrenches
-        already include the change of the Jacobian.
+        torques as a generalised force (nv,); and its derivatives (nv, nv) over q and over v. The
+        derivative over q excludes the change of the Jacobian, because RNEA's derivatives with these
+        wrenches already include it.
         """
         model, data, nv = self._model, self._data, len(v)
-        # With the angular Jacobian J of a link in its axes, the torque h x omega is the
-        # generalised force J^T [h]x J v (6.3).
+        # Let J be the angular Jacobian of a link, in the axes of the link. The torque h x omega
+        # then gives the generalised force J^T [h]x J v (6.3).
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))

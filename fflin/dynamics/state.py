@@ -424,7 +424,7 @@ class Actuation:
             self.groups[group] = np.flatnonzero(np.array(groups) == group)
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
-        # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
+        # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose
         # generalised force depends on the configuration.
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
         # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.

@@ -94,8 +94,8 @@ def row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 
 def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
-    # the least squares solution is as accurate as with Householder's method.
+    # Modified Gram-Schmidt. The right-hand side is treated as the last column of the matrix. The
+    # least squares solution is then as accurate as with Householder's method.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)

@@ -1,9 +1,9 @@
 r"""M^-1, accelerations and their derivatives at many points, with eight points per instruction.
 
-RNEA is differentiated in closed form. Let S be the spatial axis of a joint, v and a the velocity
-and acceleration of its parent, Psi' = v x S and Psi'' = a x S + v x Psi'. If joint j is on the path
-from the base to joint i, the derivatives of the joint forces tau with respect to the positions q
-and velocities q' are
+RNEA is differentiated in closed form. Let S be the spatial axis of a joint, and let v and a be the
+velocity and acceleration of its parent. Define Psi' = v x S and Psi'' = a x S + v x Psi'. If joint
+j is on the path from the base to joint i, the derivatives of the joint forces tau with respect to
+the positions q and velocities q' are
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
@@ -13,8 +13,8 @@ and velocities q' are
 
 where I_i, B_i and f_i are the inertia, the Coriolis matrix and the force of joint i's subtree. For
 an angular velocity w, 2 B w is the force 2 w x p and the moment 2 (tr G - G) w + w x h. Here p is
-the momentum of the subtree, G = sum m v r^T its first moments of momentum about the joint, and h
-its stored momentum.
+the momentum of the subtree, and h is its stored momentum. G = sum m v r^T are its first moments of
+momentum about the joint.
 
 References
 ----------

@@ -28,10 +28,11 @@ class Mechanics(
     """Robot parameters of the loop; each array of doubles may have a second axis of eight lanes.
 
     - `gravity` (3,).
-    - Fields of each joint: its entry of q (`index`); whether this entry is the cosine of an angle
-      (`circling`); the change of the entry per unit of q_m (`scale`, 1 except for modal
-      amplitudes); whether the joint has a spring or damper (`springy`); and the position at which
-      the spring is relaxed (`rest`).
+    - `index`, `circling`: for each joint, its entry of q, and whether it is the cosine of an angle.
+    - `scale`: for each joint, the change of this entry per unit of q_m. It is 1 except for modal
+      amplitudes.
+    - `springy`, `rest`: for each joint, whether it has a spring or damper, and the position at
+      which the spring is relaxed.
     - `held`: the index of the first of the three inputs of each torque or force on the base in
       reference axes. `triads`: the same indices for torques and forces in any axes.
     - `origin` (7,): placement of the world's origin relative to the reference.

@@ -147,11 +147,11 @@ class Method(
     - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
       each stage. The last row is a second displacement after the last stage.
     - `speed`: rows with the same weights for the velocity after each stage.
-    - `origin`: for each displacement, 0 if it starts at the configuration of the first stage, or 1
-      if it starts at the configuration of the second stage.
+    - `origin`: the stage from whose configuration each displacement starts: 0 for the first stage,
+      1 for the second.
     - `nodes` [s]: times of the stages.
-    - `weights`, `moments`: weights of the stages in an integral and in a double integral over the
-      step, including h and h^2.
+    - `weights`: weights of the stages in an integral over the step, including h. `moments`: their
+      weights in a double integral over the step, including h^2.
     - Work space: v and the accelerations of the stages (`rates`), a displacement (`along`), and q
       at the `first` and the `second` stage.
     - `u` (nu,): inputs at the beginning of the last step.

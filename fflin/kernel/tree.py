@@ -175,9 +175,10 @@ class Tree(
     - `row`, `depth`: offset of each row, and the number of its entries before the diagonal.
     - `path`: the coordinate of each entry.
     - `common`: the number of coordinates that two rows have in common.
-    - `target`, `share`: for each pair of a body and a body on its path inwards, the entry to which
-      the pair contributes, and the factor of the contribution. After the pairs of a body, `target`
-      holds the first of the six entries that couple the body to the base.
+    - `target`, `share`: one value for each pair of a body and a body on its path to the base.
+      `target` is the entry of M to which the pair contributes, `share` the factor of the
+      contribution. After the pairs of a body, `target` holds the first of the six entries that
+      couple the body to the base.
 
     Fields of the loads:
 

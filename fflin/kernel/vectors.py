@@ -1,9 +1,9 @@
 """Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
 
-A function of the kernel is a Python function. Called directly, with arrays or lists of one axis, it
-computes one number at a time. The Python engine calls it like this, and a debugger can step through
-it. `kernel.machine_code` compiles the same function, also for arrays with a second axis of eight
-lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
+A function of the kernel is a Python function. The Python engine calls it directly, with arrays or
+lists of one axis. It then computes one number at a time, and a debugger can step through it.
+`kernel.machine_code` compiles the same function, also for arrays with a second axis of eight lanes.
+In compiled code, other operations of `kernel.machine_code` replace the operations below.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
