@@ -112,7 +112,10 @@ def split_by_poles(
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
-    """Return a real orthonormal basis (m, k) of the left eigenvectors of A orthogonal to B."""
+    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to B.
+
+    The basis is real and orthonormal. The second result is the margin of the rank decisions.
+    """
     from scipy.linalg import eig
 
     poles, left = eig(A, left=True, right=False)

@@ -95,7 +95,7 @@ class SecondOrder:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether springs and dampers are symmetric, and all dampers have the same sign."""
+        """Whether K and D are symmetric, and D is positive or negative semidefinite."""
         units = np.outer(self.size, self.size)
         for matrix in (self.K.values / units, self.D.values / units):
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():

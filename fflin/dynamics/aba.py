@@ -135,7 +135,7 @@ class Aba:
         state = self.state
         if not state.robot.followers:
             return pin.aba(model, self._data, q, v, state.lift(forces), external)
-        # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
+        # Mimic joints: solve S^T M S nudot = S^T (tau - b) with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
         return state.spread(np.linalg.solve(M, forces - state.forces(bias)))

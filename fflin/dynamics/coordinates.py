@@ -115,7 +115,7 @@ class Chart:
 
     @classmethod
     def of(cls, quaternion: Array) -> Chart:
-        """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
+        """Return the chart at unit quaternions (.., 4) of refMb; their sign is arbitrary."""
         if quaternion.ndim == 1:
             quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
             return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))

@@ -167,7 +167,7 @@ def _unpack(work, start, entries, out, first, offset):
 
 @compiled
 def derive(tree, points, out, lanes, work):
-    """Write the results of `RowAccelerations` at eight or more points, which may be at rest."""
+    """Write the results of `RowAccelerations` at eight or more points; `nu` is empty at rest."""
     q, nu, force, u = points
     c, A, by_u, judged = out
     size = len(tree.row)

@@ -1,7 +1,8 @@
 """The closed loop: policy, actuator channel, steps on the manifold, and statistics of a run.
 
-The channel applies limits, sample and hold, delay, pulses and wheel speeds to the commands of the
-policy. The Python engine and the compiled engine both call its functions; see `control.channel`.
+The channel applies limits, sample and hold, delays, pulses and wheel speed limits to the commands
+of the policy. The Python engine and the compiled engine both call its functions; see
+`control.channel`.
 """
 
 from collections import namedtuple

@@ -115,7 +115,7 @@ OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Decorate a function that generates the code which replaces a function of `kernel.vectors`.
+    """Decorate a generator of the code that replaces a function of `kernel.vectors`.
 
     In place of an array, the function gets the address of the array's first entry, which is a
     double or a vector.

@@ -154,13 +154,13 @@ class Law(
 
     - `kind`: NOTHING, LINEAR or TRACK. LINEAR computes u from y with `grid` if the grid has joints,
       and else with `filter`. TRACK computes u = u* - K e along `path`.
-    - `x`: the state, followed by the outputs of gyroscopes, which are on the bodies `gyros` (k,).
-      Their axes `gyro_axes` (9 k,) are columns in body axes.
-    - `y` (ny,): the entries `measured` of x, plus a row of `added` (slots, ny). Each sample uses
-      the next row, and the rows repeat.
+    - `x`: the state, followed by the outputs of the gyroscopes. `gyros` (k,): the body of each
+      gyroscope. `gyro_axes` (9 k,): its axes, as columns in body axes.
+    - `y` (ny,): the entries `measured` of x, plus a row of the noise `added` (slots, ny). Each
+      sample uses the next row, and the rows repeat.
     - `turned`: whether omega_b and v_b of the state are in reference axes.
-    - `origin` (rows, 7): placement of the world's origin relative to the pose at which x is 0.
-      `near` (rows, n): the angles of continuous joints are unwrapped to be nearest to these
+    - `origin` (rows, 7): placement of the world's origin relative to the pose at which q_b and r_b
+      are 0. `near` (rows, n): the angles of continuous joints are unwrapped to be nearest to these
       positions. Both have one row per sample; after the last sample, the last row applies.
     - `u`: the command, which `allocation` distributes if it has inputs.
     """
