@@ -338,8 +338,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of the named states with inertia M, and of the outputs that they determine.
-    """
+    """Return the model of the named states with inertia M, and the outputs that they determine."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}

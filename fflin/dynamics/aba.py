@@ -143,7 +143,7 @@ class Aba:
     def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the acceleration derivatives over q, v and force for mimic joints."""
+        """Return the acceleration derivatives over q, v and force of a robot with mimic joints."""
         # The accelerations satisfy S^T M S nudot = S^T (tau - b). The constraint forces of mimic
         # joints drop out of this equation. ABA needs a regular M, but M is singular if a mimic
         # joint or its leader moves no mass. So each mimic joint and its leader get a rotor. The

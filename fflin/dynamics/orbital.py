@@ -35,9 +35,9 @@ class OrbitField:
     """Acceleration field of a circular orbit in its rotating frame.
 
     The frame rotates with `rate` (3,) [rad/s]. At a position x, the gravity gradient per unit mass
-    is `tide` x. A point at rest at x in the frame has the acceleration `pull` x = n^2 (3 r r^T - z
-    z^T) x. The columns of `axes` (3, 3) are the unit vectors away from the central body, along the
-    orbit and along its normal.
+    is `tide` x. A point at rest in the frame has the acceleration `pull` x = n^2 (3 r r^T - z z^T)
+    x. The columns of `axes` (3, 3) are the unit vectors away from the central body, along the orbit
+    and along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
@@ -98,8 +98,8 @@ class OrbitField:
         R, center = self._bodies(data)
         back = R.swapaxes(1, 2)
         force = self._mass * (back @ (self.tide @ center))[..., 0]
-        # The torque 3 n^2 r x (I r) consists of three entries of the skew-symmetric matrix I `tide`
-        # - `tide` I, with `tide` in body axes.
+        # The skew-symmetric matrix I `tide` - `tide` I, in body axes, contains the three entries of
+        # the torque 3 n^2 r x (I r).
         turn = self._inertia @ (back @ self.tide @ R)
         turn -= turn.swapaxes(1, 2)
         torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
@@ -140,8 +140,8 @@ class OrbitField:
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # The next lines differentiate the relative accelerations. The angular one is dw/dt + w x
-        # spin, where dw/dt is inertial. The linear one is c + fall - 2 spin x v - w x v.
+        # The next lines differentiate the relative accelerations. They are dw/dt + w x spin, with
+        # the inertial dw/dt, and c + fall - 2 spin x v - w x v.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin

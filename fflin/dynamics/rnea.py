@@ -15,12 +15,12 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. 1 /
-# (M^-1)_ii is the inertia of i if all other coordinates are free. The smaller this inertia is
-# relative to M_ii, the larger is the coupling. Coupling times machine epsilon is the relative error
-# of (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine
-# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum
-# below the number of coordinates shows that some pivots are only rounding errors.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. If all other
+# coordinates are free, i has the inertia 1 / (M^-1)_ii. The smaller this inertia is relative to
+# M_ii, the larger is the coupling. Coupling times machine epsilon is the relative error of
+# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine correct
+# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
+# number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
