@@ -146,7 +146,7 @@ def least_squares(least, most, size):
 def allocate(allocation, point, commanded):
     """Write the inputs whose accelerations are nearest to the accelerations of a command.
 
-    Without an allocation problem, the inputs are the command.
+    If there is no allocation problem, the command is written unchanged.
     """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
@@ -161,7 +161,7 @@ def allocate(allocation, point, commanded):
     turn_held(asking, own)
     push(work, tree, own.pushing)
     vec.copy(work, tree.c, columns, count * size, size)
-    # The generalised force per unit of each input, one input after the other.
+    # Write the generalised force per unit of each input, one input after the other.
     tree = giving.tree
     carried = len(tree.wrench_body)
     for entry in range(len(tree.driven) * size):

@@ -218,7 +218,7 @@ def motion_cross(velocity, along):
 
 
 def at_joint(work, at, place):
-    """Shift the parent's motion vector at `at` to the origin of a joint."""
+    """Read the parent's motion vector at the offset `at`, and shift it to a joint's origin."""
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 

@@ -1,4 +1,4 @@
-"""Compilation of the kernel's functions by numba, with the functions that they call.
+"""Compilation of the kernel's functions, and of the functions that they call, by numba.
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
 machine code for each function together with all functions that it calls. A function at the end of a

@@ -24,7 +24,7 @@ _TERMS = 10  # exact to machine precision up to half a turn; a step rotates by l
 
 F = TypeVar("F", bound=Callable[..., object])
 
-# One number; in compiled code also eight lanes.
+# One number; in compiled code, one number or eight lanes.
 Number: TypeAlias = float
 # Numbers in memory. The entries of a list are read faster than the entries of an array.
 Entries: TypeAlias = Array | list[Number]
