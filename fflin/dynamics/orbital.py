@@ -35,9 +35,9 @@ class OrbitField:
     """Acceleration field of a circular orbit in its rotating frame.
 
     The frame rotates with `rate` (3,) [rad/s]. At a position x, the gravity gradient per unit mass
-    is `tide` x. In the frame, a point at rest has the acceleration `pull` x, with `pull` = n^2 (3 r
-    r^T - z z^T). The columns of `axes` (3, 3) are the unit vectors away from the central body,
-    along the orbit and along its normal.
+    is `tide` x. A point at rest in the frame has the acceleration `pull` x. The matrix `pull` is
+    equal to n^2 (3 r r^T - z z^T). The columns of `axes` (3, 3) are the unit vectors away from the
+    central body, along the orbit and along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
