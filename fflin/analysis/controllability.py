@@ -28,8 +28,8 @@ _LOOPS = (
     "joint amplitude e, although the linear model does not show it"
 )
 
-# Relative singular values of the equilibrated Popov-Belevitch-Hautus matrix below this count as
-# zero, because repeated eigenvalues have errors of this size.
+# Singular values of the scaled Popov-Belevitch-Hautus matrix count as zero if they are below this
+# fraction of the largest. Repeated eigenvalues have errors of this size.
 _RANK = 1e-7
 
 
@@ -236,10 +236,11 @@ def controllability(lin: LinearModel) -> Controllability:
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
 ) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
-    """Split the 2 r states without conserved momenta at rest; None if the test is inconclusive.
+    """Split the 2 r states that remain without the conserved momenta, for a model at rest.
 
-    Return a basis (2 r, d) of the controllable subspace, rows (2 r - d, 2 r) on which no input
-    acts, their names or None if these follow from the states, the method, and the fixed poles.
+    Return None if the test is inconclusive. Otherwise return five results: a basis (2 r, d) of the
+    controllable subspace; rows (2 r - d, 2 r) on which no input acts; the names of these rows, or
+    None if the caller must form them from the state names; the method; and the fixed poles.
     """
     source, R = mechanics.at_rest(lin), conserved.rates
     if source is None:
@@ -256,8 +257,8 @@ def _by_second_order(
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
-    # The system is symmetric. Each motion (s, v) that the output S^T s does not observe therefore
-    # gives a row, a combination of states on which no input acts.
+    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
+    # therefore gives a row: a combination of states on which no input acts.
     motions, shapes, fixed = found
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
@@ -345,7 +346,7 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 def _conclude(
     kind: type[FflinError], words: str, notes: Sequence[str], margin: ranks.Margin
 ) -> None:
-    """Raise an error with `words` and the undecided ranks; without `words`, warn of these ranks."""
+    """Raise an error with `words` and the undecided ranks, or only warn if `words` is empty."""
     doubts = [note for note in notes if note.startswith("undecided")]
     if words:
         error: Any = kind("; ".join((words, *doubts)))
@@ -369,16 +370,17 @@ def _root(W: Array) -> Array:
 def _reached(
     lin: LinearModel, A: Array, B: Array, what: str, complaint: str, *, unstable: bool = False
 ) -> tuple[str, list[str], ranks.Margin]:
-    """Return words if B misses a mode on the stability boundary, undecided ranks, and the margin.
+    """Test whether B misses a mode of A on the stability boundary.
 
-    Modes beyond the boundary are tested if the design must stabilise `unstable` modes.
+    Return an error message, which is empty if no mode is missed, notes on undecided ranks, and the
+    margin. If `unstable`, modes beyond the boundary are tested as well.
     """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
-    # rounding error. Poles closer than 1e-3 of the largest therefore count as equal.
+    # rounding error. Poles closer than 1e-3 times the largest pole therefore count as equal.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & unstable
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:

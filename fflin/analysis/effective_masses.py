@@ -16,7 +16,8 @@ from fflin.linear.model import LinearModel
 _EQUAL = 1e-9
 
 # Effective masses below this fraction of the total are rounding error. An effective mass is the
-# square of a singular value, so the limit of singular values is the square root of this fraction.
+# square of a singular value, so singular values are squared before they are compared with this
+# limit.
 _ROUNDING = 1e-14
 
 
@@ -184,7 +185,7 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Return L (6, k); modes of equal frequency are combined so that the first has most mass."""
+    """Combine modes of equal frequency in L (6, k) so that the first of them has the most mass."""
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]

@@ -1,8 +1,8 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
 `split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B].
-`unobservable` tests second-order systems by the null space of [p^2 M + p D + K; C_s + p C_v], which
-is less sensitive to rounding.
+`unobservable` tests a second-order system by the null space of [p^2 M + p D + K; C_s + p C_v]. This
+test is less sensitive to rounding.
 """
 
 from operator import itemgetter
@@ -14,8 +14,9 @@ from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
 # A singular value above _SUSPICIOUS counts as nonzero. Singular values are computed only for
-# suspicious eigenvectors. An eigenvector is suspicious if its product with the unit input columns
-# is below _SUSPICIOUS, or if another eigenvalue is closer than _SUSPICIOUS to its eigenvalue.
+# suspicious eigenvectors. An eigenvector is suspicious in two cases: its product with the unit
+# input columns is below _SUSPICIOUS, or its eigenvalue is closer than _SUSPICIOUS to another
+# eigenvalue.
 _SUSPICIOUS = 1e-3
 
 # Eigenvalues closer than _SAME_POLE count as equal, because rounding moves a defective eigenvalue
@@ -23,17 +24,17 @@ _SUSPICIOUS = 1e-3
 # defective. A defective pole has too few eigenvectors for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# The Rayleigh quotient of a singular vector refines a pole and converges quadratically, in few
-# steps. Refining a second-order pole may take twice as many steps, each smaller than _NEAR times
-# the pole.
+# The Rayleigh quotient of a singular vector refines a pole. It converges quadratically, so
+# _REFINEMENTS steps are enough. A second-order pole is refined in at most twice as many steps. Its
+# refinement stops if a step is larger than _NEAR times the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
-# Two poles are aliased if sampling brings them closer than this. A state that is observable in the
-# continuous model may then be unobservable in the sampled one.
+# Two poles are aliased if they are apart but sampling brings them closer than this. A state that is
+# observable in the continuous model may then be unobservable in the sampled one.
 _ALIASED = 1e-6
 
-# A pole whose decay rate is below this may belong to a defective pair at zero, because rounding
-# moves such a pair by the square root of the rounding error.
+# A pole whose decay rate is below this may belong to a defective pair at zero. Rounding moves such
+# a pair by the square root of the rounding error.
 _DECAY = 1e-7
 
 # If one sample reduces a motion below this fraction, only its rounding error remains.
@@ -45,9 +46,9 @@ def split_by_poles(
 ) -> tuple[Array, Array, Array, ranks.FixedPoles]:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
 
-    Return a basis (nx, d) of the controllable subspace, its complement (nx, nx - d), which is the
-    unobservable subspace of a dual pair, rows (nx - d, nx) on which no input acts, and the fixed
-    poles.
+    Return four results: a basis (nx, d) of the controllable subspace; its complement (nx, nx - d);
+    rows (nx - d, nx) on which no input acts; and the fixed poles. For a dual pair, the complement
+    is the unobservable subspace.
     """
     # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
     # The states are scaled to units of energy, x = to_x xi. Velocities are scaled to L^T nu with
@@ -111,7 +112,10 @@ def split_by_poles(
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
-    """Return a real orthonormal basis (m, k) of the left eigenvectors of A orthogonal to B."""
+    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to B.
+
+    The basis is real and orthonormal. The second result is the margin of the rank decisions.
+    """
     from scipy.linalg import eig
 
     poles, left = eig(A, left=True, right=False)
@@ -154,10 +158,11 @@ def unobservable(
 ) -> tuple[Array, tuple[tuple[complex, Values], ...], ranks.FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
-    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. The
-    result is a basis (2 nv, k) of them, as (s, ds/dt), each nonzero pole or pair of the continuous
-    model with its shapes (nv, m), and the fixed poles. It is None if this test is inconclusive: K
-    or D is not symmetric, D is indefinite, sampling aliases two poles, or a pole is defective.
+    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. Return
+    three results: a basis (2 nv, k) of these motions (s, ds/dt); the nonzero poles of the
+    continuous model, one of each conjugate pair, with their shapes (nv, m); and the fixed poles.
+    Return None if the test is inconclusive, because K or D is not symmetric, D is indefinite,
+    sampling aliases two poles, or a pole is defective.
     """
     # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
     # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.

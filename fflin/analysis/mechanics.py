@@ -1,4 +1,4 @@
-"""A linear model as a mechanical system M a + D v + K s = S u, its conserved momenta, and names."""
+"""Linear models as mechanical systems M a + D v + K s = S u; conserved momenta and their names."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from fflin.linear.model import LinearModel
 # Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
 _SYMMETRIC = 1e-8
 
-# If the relative residual of a momentum exceeds this, no coordinate has the momentum as its rate,
-# because the operating point is in motion.
+# If the relative residual of a momentum exceeds this, the operating point is in motion. The
+# momentum is then not the rate of any coordinate.
 _CONSISTENT = 1e-8
 
-# Rounding error of springs per squared spin rate and of dampers per spin rate, in units of energy.
+# Rounding error in units of energy: for springs, it is multiplied by the squared spin rate; for
+# dampers, by the spin rate.
 _OF_SPIN = 1e-15
 
-# If the orbital rate, relative to the fastest vibration, is below this, the square of the ratio is
-# close to rounding error.
+# Orbital effects depend on the square of the orbital rate divided by the fastest vibration rate. If
+# this ratio is below _SLOWEST, its square is close to rounding error.
 _SLOWEST = 3e-6
 
 
@@ -94,7 +95,7 @@ class SecondOrder:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether springs and dampers are symmetric, and all dampers have the same sign."""
+        """Whether K and D are symmetric, and D is positive or negative semidefinite."""
         units = np.outer(self.size, self.size)
         for matrix in (self.K.values / units, self.D.values / units):
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
@@ -161,7 +162,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return `lin` or its continuous model if that model is a second-order system, else None."""
+    """Return the continuous model, or else `lin`; None if that is not a second-order system."""
     # The continuous model has this structure if the rates of the positions depend on the
     # velocities alone. The structure then also applies to a model sampled from it. A sampled model
     # without its continuous model has this structure only if there are no forces.

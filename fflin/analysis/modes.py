@@ -220,7 +220,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return tables of the appendage modes (robot free, base fixed) and of effective masses."""
+        """Return tables of the appendage modes (link free, link clamped) and effective masses."""
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -357,7 +357,7 @@ def energies_of(
 ) -> tuple[Mapping[str, float], Mapping[str, float]]:
     """Return {body: fraction of the kinetic energy} and {joint: fraction of the elastic energy}.
 
-    They belong to a mode with a shape (nx,), see `Mode`. Without a robot, they are empty.
+    `shape` (nx,) is the shape of a mode, see `Mode`. Without a robot, both results are empty.
     """
     if robot is None:
         return {}, {}

@@ -13,7 +13,7 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A pole whose decay rate, relative to the fastest pole, is below this may be a pole at zero that
+# If a pole's decay rate divided by the fastest pole is below this, the pole may be a zero pole that
 # rounding has moved.
 _DECAY = 1e-7
 

@@ -17,9 +17,9 @@ _CLEAN = 1e-10
 # tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# The threshold of a force is _FLOOR times the largest force of the same kind, per unit of energy. A
-# force below the threshold may be rounding error. A force below _ROUNDING times the threshold is
-# set to zero.
+# Forces are compared in units of energy. A force below a threshold, _FLOOR times the largest force
+# of the same kind, may be rounding error. A force below _ROUNDING times the threshold is set to
+# zero.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
@@ -28,7 +28,7 @@ class Decision(NamedTuple):
 
     ratio: float
     at: Values  # singular vector
-    states: int = 1  # states concerned: 2 for a pair of poles, or a momentum and its coordinate
+    states: int = 1  # states affected: 2 for a pair of poles, or for a momentum and its coordinate
 
 
 class Margin(NamedTuple):
@@ -62,7 +62,7 @@ class Margin(NamedTuple):
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
-        """Decisions within rounding error: ratio, direction, change of the number of states."""
+        """Undecided ranks: ratio, direction, and how the number of states would change."""
         counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
         left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
         return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
@@ -119,7 +119,7 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 
 
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Set entries that are rounding errors to zero; sizes are compared in units of energy."""
+    """Set entries that are rounding errors to zero; compare their sizes in units of energy."""
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
@@ -181,7 +181,7 @@ def unit_columns(matrix: Array) -> Array:
 def echelon(
     columns: Array, weights: Array, preferred: Array | None = None
 ) -> tuple[Array, Indices]:
-    """Return a basis (m, r) of independent columns, with identity pivot rows, and the pivots."""
+    """Return a basis (m, r) of the column space, whose pivot rows form I, and the pivots."""
     from scipy.linalg import qr
 
     size = columns.shape[1]

@@ -26,7 +26,8 @@ Part = TypeVar("Part", bound=LinearModel)
 # A value below this fraction of the largest value is rounding error.
 _ROUNDING = 1e-9
 
-# The reduced state may leave out a part of f0 up to this fraction of the largest entry of f0.
+# The part of f0 that the reduced state omits must be below this fraction of the largest entry of
+# f0.
 _DRIFT = 1e-9
 
 
@@ -253,7 +254,11 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the wheels whose angle has no effect, and those of them whose speed has none."""
+    """Return two groups of wheels whose states do not affect the other states.
+
+    In the first group, the angle has no effect. The second group is the part of the first in which
+    the speed has no effect either.
+    """
     # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
     # friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
@@ -267,8 +272,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # Combinations of inputs that exert no net force at rest may still change wheel speeds. The
-    # number of kept wheels is the number of independent combinations. By default, wheels are kept
+    # Some combinations of inputs exert no net force at rest but change the wheel speeds. As many
+    # wheels are kept as there are independent changes of this kind. By default, wheels are kept
     # only if inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
@@ -319,7 +324,7 @@ def rigid_forces(body: LinearModel) -> Noisy:
 
 
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
-    """Remove coordinates (k,) and their rates from a model; exact for any motion of them (9.4)."""
+    """Remove coordinates (k,) and their rates from a model; exact for all their motions (9.4)."""
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = mechanics.floating_inertia(lin.M, kept, removed)
@@ -333,7 +338,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of the named states, with the inertia M and the outputs of these states."""
+    """Return the model of the named states with inertia M, and the outputs that they determine."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
@@ -372,7 +377,10 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
-    """Add the certificate of a whole model to its part, and a source to a sampled part."""
+    """Add the source of a part of a model.
+
+    The source is `lin`, or if `lin` is sampled, the same part of its continuous model.
+    """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)
     return replace(part, _source=(part.fingerprint, whole))

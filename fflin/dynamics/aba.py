@@ -20,14 +20,14 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
-        # M^-1 in base axes by ABA, at the point given in the last call of `slopes`.
+        # M^-1 in base axes, which the last call of `slopes` computed by ABA.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = state.field
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order for u in base axes and an extra force tau."""
+        """Return dv/dt (nv,) in Pinocchio's order; u is in base axes, tau an additional force."""
         forces = self.actuation.fixed @ u
         if self._resists:
             forces += self._passive_force(q, v)
@@ -62,9 +62,13 @@ class Aba:
         return np.abs(np.linalg.inv(M)) @ forces
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""
+        """Return the derivatives of dnu/dt over the tangent of q, over nu and over u.
+
+        The derivatives (6 + n, ..) are in state order, and `u` is in base axes.
+        """
         # Wrenches of thrusters are constant in the frames of their links, so the derivative over q
-        # includes d(B u)/dq. B comes from the accelerations of unit inputs at rest.
+        # includes d(B u)/dq. The derivatives over u are the accelerations that unit inputs cause at
+        # rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau, field = state.lift(self.actuation.fixed @ u + self._passive_force(q, v)), self.field
@@ -85,7 +89,7 @@ class Aba:
         for joint, momentum in state.robot.stored_momentum:
             pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, at_rest)
             local = self._model, self._data, joint, pin.ReferenceFrame.LOCAL
-            # Derivatives over q and v of the angular velocity of the link in its axes.
+            # Derivatives of the link's angular velocity, in the link's axes, over q and v.
             turning, jacobian = (x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local))
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
@@ -104,7 +108,7 @@ class Aba:
         return by_q, by_v, np.column_stack(by_u)
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return the wrenches on the links: of inputs, gyroscopic torques and gravity gradient."""
+        """Return the wrench on each link: inputs, gyroscopic torques and gravity gradient."""
         stored, wrenches = self.state.robot.stored_momentum, self.actuation.wrenches(u)
         wrenches = wrenches or self._none
         if not (stored or self.field):
@@ -131,7 +135,7 @@ class Aba:
         state = self.state
         if not state.robot.followers:
             return pin.aba(model, self._data, q, v, state.lift(forces), external)
-        # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
+        # Mimic joints: solve S^T M S nudot = S^T (tau - b) with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
         return state.spread(np.linalg.solve(M, forces - state.forces(bias)))
@@ -139,11 +143,12 @@ class Aba:
     def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the derivatives for robots with mimic joints: S^T M a = S^T (tau - b)."""
-        # The constraint forces of mimic joints drop out of this equation. ABA needs a regular M,
-        # but M is singular if a mimic joint or its leader moves no mass. So each mimic joint and
-        # its leader get a rotor. The rotor's inertia is the diagonal entry of S^T M S for their
-        # coordinate. The rotors' contribution to S^T M S is subtracted afterwards.
+        """Return the acceleration derivatives over q, v and force of a robot with mimic joints."""
+        # The accelerations satisfy S^T M S nudot = S^T (tau - b). The constraint forces of mimic
+        # joints drop out of this equation. ABA needs a regular M, but M is singular if a mimic
+        # joint or its leader moves no mass. So each mimic joint and its leader get a rotor. The
+        # rotor's inertia is the diagonal entry of S^T M S for their coordinate. The rotors'
+        # contribution to S^T M S is subtracted afterwards.
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
-# Frames of a circular orbit. For a robot in orbit, one of them takes the place of the world frame.
+# Frames of a circular orbit. If a robot is in orbit, one of them replaces the world frame.
 ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
-# Whether (omega_b, v_b) are expressed in reference axes instead of base axes. The same holds for
-# the wrenches (tau_b, F_b).
+# For each frame, whether omega_b and v_b are expressed in reference axes instead of base axes. The
+# same axes apply to tau_b and F_b.
 IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "hybrid": (False, True),
     "local": (False, False),
@@ -35,7 +35,7 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     **dict.fromkeys(ORBITAL, (False, True)),
 }
 
-# Rows of the base's angular and linear part in a velocity or force (6 + n) of state order,
+# Rows of the base's angular and linear parts in a velocity or force (6 + n,) in state order.
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
 # The same rows in Pinocchio's v and spatial vectors.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
@@ -107,7 +107,7 @@ _IDENTITY = np.eye(3)
 class Chart:
     """Attitude chart at one or many base attitudes relative to the reference."""
 
-    standing: ClassVar[bool] = False  # whether the base is at the reference
+    standing: ClassVar[bool] = False  # whether the base has the reference attitude
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # scalar part (.., 1) of this quaternion, positive
@@ -115,7 +115,7 @@ class Chart:
 
     @classmethod
     def of(cls, quaternion: Array) -> Chart:
-        """Return the chart at unit quaternions (.., 4) of refMb, of either sign."""
+        """Return the chart at unit quaternions (.., 4) of refMb; their sign is arbitrary."""
         if quaternion.ndim == 1:
             quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
             return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
@@ -153,11 +153,11 @@ class Chart:
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply parts of x (.., m, k), three rows each, by R in place."""
+        """Multiply parts of x (.., m, k), which have three rows each, by R in place."""
         _turn(self.R, () if self.standing else parts, x)
 
     def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply parts of x (.., k, m), three columns each, by R^T from the right, in place."""
+        """Multiply parts of x (.., k, m), of three columns each, by R^T from the right in place."""
         for columns in () if self.standing else parts:
             x[..., columns] = product(x[..., columns], self.R.mT)
 
@@ -194,7 +194,7 @@ _TURN = 2.0 * np.pi
 
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
-    """Return the states (.., nx) of valid q (.., nq) and nu (.., 6 + n) in base axes."""
+    """Return the states (.., nx) at valid q (.., nq) and nu (.., 6 + n); nu is in base axes."""
     return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
 
 
@@ -212,7 +212,7 @@ def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
 def readout(
     state: StateMap, K: Array, offset: Array, near: Array
 ) -> Callable[[Array, Array], Array]:
-    """Return the function f(q, v) = offset - K x(q, v) (m,), with angles nearest to `near`."""
+    """Return the function f(q, v) = offset - K x(q, v); x has the angles nearest to `near`."""
     # q_b is linear in the quaternion of q, r_b is linear in the position of q, and velocities in
     # reference axes are linear in R v. So f is one matrix-vector product. It takes a fifth of the
     # time of computing x.
@@ -299,7 +299,7 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
 
 
 def moving_errors(frame: str, x: Array, target: Array) -> Array:
-    """Return the errors (N, nx) of states from a moving reference, in its axes (9.5)."""
+    """Return the errors (N, nx) of states from moving targets, in the axes of the targets (9.5)."""
     e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
     turned, scalar = _apart(x, target)
     e[:, :3] = turned * np.where(scalar < 0.0, -1.0, 1.0)
@@ -310,7 +310,7 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 
 
 def moved_by(frame: str, target: Array, e: Array) -> Array:
-    """Return the states (N, nx) that have errors e from a target; NaN if |q_b| of e exceeds 1."""
+    """Return the states (N, nx) with errors e from a target; NaN if |q_b| of e exceeds 1."""
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
     x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
@@ -337,7 +337,7 @@ def _in_reference(frame: str, nx: int) -> list[Indices]:
 
 
 def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
-    """Return the error (nx,) from a moving reference, in its axes."""
+    """Return the error (nx,) from a moving reference, in the axes of the reference."""
     g = state.groups
     e = np.empty(state.nx)
     turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])

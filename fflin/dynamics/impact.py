@@ -1,4 +1,4 @@
-"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities just after."""
+"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities after them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -153,7 +153,7 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> Impact:
-    """Join robots at (q, v) to one robot (13.1); the impulses are generalised ones of the parts."""
+    """Join robots at (q, v) to one robot (13.1); return generalised impulses on the parts."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -197,7 +197,7 @@ def inertia_at(robot: Robot, q: Array) -> Array:
 
 
 def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
-    """Return linear and angular momentum (6,) about the world's origin, in its axes."""
+    """Return (linear, angular) momentum (6,) about the world's origin, in world axes."""
     data = robot.create_data()
     pin.computeCentroidalMomentum(robot.model, data, q, v)
     linear, angular = data.hg.linear, data.hg.angular + np.cross(data.com[0], data.hg.linear)

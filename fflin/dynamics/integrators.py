@@ -34,9 +34,10 @@ class Integrator:
     # Stage from whose configuration each displacement starts: 0 for the first stage (the beginning
     # of the step), 1 for the second.
     origins: ClassVar[tuple[int, ...]]
-    # Weights of h v and h^2 l1, h^2 l2, ... in the displacement to each new q.
+    # Weights of h v, h^2 l1, h^2 l2, ... in the displacement to each new q. Here v is the velocity
+    # at the beginning of the step, and l1, l2, ... are the accelerations of the stages.
     displacements: ClassVar[tuple[tuple[float, ...], ...]]
-    # Weights of v and h l1, h l2, ... in each new v.
+    # Weights of v, h l1, h l2, ... in each new velocity.
     speeds: ClassVar[tuple[tuple[float, ...], ...]]
 
     def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
@@ -48,7 +49,7 @@ class Integrator:
 
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v and the stages' accelerations l for each new q and each new v."""
+        """Return the weights of v, l1, l2, ... for each new q and new velocity in a step of dt."""
         displacement, speed = np.array(cls.displacements), np.array(cls.speeds)
         displacement[:, 0] *= dt
         displacement[:, 1:] *= dt * dt

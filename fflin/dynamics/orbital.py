@@ -14,7 +14,8 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Unit vectors away from the central body and along the orbit's normal, in each frame.
+# For each frame: the unit vector away from the central body, and the unit vector along the orbit's
+# normal.
 _AXES = {
     "hill": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "lvlh": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
@@ -33,10 +34,10 @@ _COARSE, _USELESS = 0.01, 0.5
 class OrbitField:
     """Acceleration field of a circular orbit in its rotating frame.
 
-    The frame rotates with `rate` (3,) [rad/s]. At position x the gravity gradient per mass is
-    `tide` x. A point at rest in the frame has the acceleration `pull` x = n^2 (3 r r^T - z z^T) x.
-    The columns of `axes` (3, 3) are the unit vectors away from the central body, along the orbit
-    and along its normal.
+    The frame rotates with `rate` (3,) [rad/s]. At a position x, the gravity gradient per unit mass
+    is `tide` x. A point at rest in the frame has the acceleration `pull` x. The matrix `pull` is
+    equal to n^2 (3 r r^T - z z^T). The columns of `axes` (3, 3) are the unit vectors away from the
+    central body, along the orbit and along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
@@ -65,7 +66,7 @@ class OrbitField:
         return base.rotation, base.translation
 
     def require_near(self, q: Array) -> None:
-        """Warn or raise if the robot may extend far from the origin of the orbit frame."""
+        """Warn or raise an error if the robot may reach far from the origin of the orbit frame."""
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
         message = (
@@ -97,16 +98,17 @@ class OrbitField:
         R, center = self._bodies(data)
         back = R.swapaxes(1, 2)
         force = self._mass * (back @ (self.tide @ center))[..., 0]
-        # 3 n^2 r x (I r) is the axial vector of I tide - tide I.
+        # The skew-symmetric matrix I `tide` - `tide` I, in body axes, contains the three entries of
+        # the torque 3 n^2 r x (I r).
         turn = self._inertia @ (back @ self.tide @ R)
         turn -= turn.swapaxes(1, 2)
         torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the derivatives (nv, nv) of the forces of `wrenches` over q, for a fixed base."""
-        # With T = R^T tide R in the axes of a body, a rotation t of the body changes T by
-        # T [t]x - [t]x T.
+        """Return the derivatives (nv, nv) of the forces of `wrenches` over q, base origin fixed."""
+        # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body changes T
+        # by T [t]x - [t]x T.
         model, (R, centers) = self.robot.model, self._bodies(data)
         joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
         J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
@@ -134,11 +136,12 @@ class OrbitField:
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Convert derivatives at `near` to derivatives of the relative acceleration at q and v."""
+        """Convert derivatives at `near` to derivatives of the relative acceleration, in place."""
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # The next lines differentiate dw/dt + w x spin and dv/dt = c + fall - 2 spin x v - w x v.
+        # The next lines differentiate the relative accelerations. They are dw/dt + w x spin, with
+        # the inertial dw/dt, and c + fall - 2 spin x v - w x v.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -150,7 +153,8 @@ class OrbitField:
 
     def potential(self, data: pin.Data) -> float:
         """Return the potential energy [J] of the gravity gradient and the frame's rotation."""
-        # -1/2 times the integral of x^T G x over the mass of the robot.
+        # In the rotating frame, the potential energy is -1/2 times the integral of x^T G x over the
+        # mass of the robot, with G = `pull`.
         R, center = self._bodies(data)
         G, inertia = self.pull, self._inertia
         second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
@@ -168,16 +172,17 @@ class OrbitField:
         return R, origins[..., None] + R @ self._lever
 
 
-# Weights of the rotations about the radial direction, the direction of flight and the normal.
+# Weights, divided by n^2, of the rotations about the radial direction, the direction of flight and
+# the normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 
 
 class GravityGradient(NamedTuple):
     """Gravity-gradient field of an orbit at one base pose, in base axes.
 
-    A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x.
-    The field n^2 (3 r r^T - I) x is the sum of such terms for the radial direction, the direction
-    of flight and the normal, with the weights 2 n^2, -n^2 and -n^2.
+    A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x. The
+    field n^2 (3 r r^T - I) x is the sum of three such terms. Their weights are 2 n^2 for the radial
+    direction, -n^2 for the direction of flight and -n^2 for the normal.
     """
 
     turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation
@@ -186,7 +191,7 @@ class GravityGradient(NamedTuple):
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
-        """Return the field at a configuration (nq,), which must be near the orbit's origin."""
+        """Return the field at a configuration (nq,), which must be near the frame's origin."""
         field.require_near(q)
         R, position = field.base(q)
         n = mean_motion(field.robot)
@@ -201,7 +206,7 @@ class GravityGradient(NamedTuple):
         return total
 
     def slopes(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array]:
-        """Return the derivatives of `force` over the joints (nv, nv) and rotations (nv, 3)."""
+        """Return the derivatives of `force` over q (nv, nv) and over base rotations (nv, 3)."""
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))
         v, at_rest = np.zeros(model.nv), np.zeros(model.nv)
         for weight, v[PIN_ANGULAR] in self.turns:

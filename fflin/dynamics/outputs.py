@@ -35,7 +35,7 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Robot with its base at the origin and no linear velocity, and the removed base motion."""
+    """Robot with its base moved to the origin and v_b = 0, and the base motion thus removed."""
 
     model: pin.Model
     data: pin.Data

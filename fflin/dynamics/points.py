@@ -72,13 +72,13 @@ def require_slow(what: str, v: Array) -> None:
 
 
 def base_of(state: Mapping[str, Any]) -> pin.SE3:
-    """Return the base placement of a robot's point, start or target."""
+    """Return the base placement of a state mapping, such as a robot's point, start or target."""
     rotation = pin.rpy.rpyToMatrix(*np.radians(state.get("rpy", np.zeros(3))))
     return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
 
 
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state in which the parts, joints and rates of another state take precedence."""
+    """Merge two state mappings; parts, joints and rates of `other` take precedence."""
     both = {**state, **other}
     for part in ("joints", "velocity"):
         if part in both:
@@ -100,7 +100,7 @@ def point_of(
     v0: ArrayLike | None,
     default: Callable[[], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
-    """Return the configuration (nq,) and velocity (nv,) from x or from q and v."""
+    """Return q (nq,) and v (nv,) from x0, from q0 and v0, or by default from `default`."""
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:

@@ -15,12 +15,12 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. It
-# grows as 1 / (M^-1)_ii, the inertia of i while all other coordinates are free, becomes small
-# relative to M_ii. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine
-# correct digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a
-# smaller sum than the number of coordinates shows that some pivots are only rounding errors.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. If all other
+# coordinates are free, i has the inertia 1 / (M^-1)_ii. The smaller this inertia is relative to
+# M_ii, the larger is the coupling. Coupling times machine epsilon is the relative error of
+# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine correct
+# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
+# number of coordinates shows that some pivots are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
@@ -41,7 +41,7 @@ _crba, _compute_inverse, _cholesky = pin.crba, pin.computeMinverse, pin.cholesky
 
 
 class Inertia:
-    """M^-1 at a configuration, in base axes: angular, linear, joints."""
+    """M^-1 at a configuration, in base axes and state order."""
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
@@ -71,9 +71,9 @@ class Inertia:
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self.centred(q)
-        # The articulated-body inverse is used only if `quick`, because its rounding errors would
-        # appear in entries of M^-1 K that should be exactly zero. The relative rounding errors of
-        # a Cholesky factor do not depend on the scaling of M.
+        # The articulated-body inverse is used only if `quick`. Its rounding errors would appear in
+        # entries of M^-1 K that should be exactly zero. The relative rounding errors of a Cholesky
+        # factor do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
@@ -130,10 +130,13 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Return upper bounds of the mass or moment of inertia that each coordinate moves."""
-    # The moment of inertia of a body about the base's origin is at most the sum of two terms: its
-    # largest principal moment, and its mass times the squared length of the path to it. The path
-    # runs from joint to joint, with prismatic joints within `STROKE`.
+    """Return upper bounds of the mass or moment of inertia that each coordinate moves.
+
+    Return None if a joint is neither revolute nor prismatic.
+    """
+    # The moment of inertia of a body about the base's origin has an upper bound. It is the body's
+    # largest principal moment, plus its mass times the squared length of the path to it. The path
+    # runs from joint to joint, and includes a displacement of `STROKE` at each prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
     if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
@@ -196,9 +199,9 @@ class Accelerations:
         self._inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # Derivatives of M a + b - B u - springs over the displacements of the state, transposed so
-        # that the parts are contiguous. The first six rows, for attitude and position of the base,
-        # are zero without an orbit.
+        # Derivatives of M a + b - B u - springs over the displacements of the state. They are
+        # stored transposed, so that their parts are contiguous. The first six rows, for attitude
+        # and position of the base, are zero without an orbit.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
         self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
@@ -227,9 +230,10 @@ class Accelerations:
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # The base's placement and linear velocity are left out: in base axes c does not depend on
-        # them, and large values would cost Pinocchio's derivatives digits. Gravity is left out as
-        # well, because it accelerates all parts of the robot alike (equivalence principle).
+        # The base's placement and linear velocity are left out, because c does not depend on them
+        # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
+        # is left out as well, because it accelerates all parts of the robot alike (equivalence
+        # principle).
         q_still, v_still = self._inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
@@ -282,14 +286,14 @@ class Accelerations:
     ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
         r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
 
-        They are added to the wrenches of the inputs on every joint, and returned as a generalised
-        force (nv,) with its derivatives (nv, nv) over q and v. In the derivative over q the
-        Jacobian is constant, because RNEA's derivatives with these wrenches already include the
-        change of the Jacobian.
+        Return four results: the wrenches on all joints, with the gyroscopic torques added; the
+        torques as a generalised force (nv,); and its derivatives (nv, nv) over q and over v. The
+        derivative over q excludes the change of the Jacobian, because RNEA's derivatives with these
+        wrenches already include it.
         """
         model, data, nv = self._model, self._data, len(v)
-        # With the angular Jacobian J of a link in its axes, the torque h x omega is the
-        # generalised force J^T [h]x J v (6.3).
+        # Let J be the angular Jacobian of a link, in the axes of the link. The torque h x omega
+        # then gives the generalised force J^T [h]x J v (6.3).
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))

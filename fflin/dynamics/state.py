@@ -1,4 +1,4 @@
-"""State X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart; and inputs."""
+"""State x = (q_b, r_b, q_m, omega_b, v_b, qdot_m), its frames and chart, and the inputs."""
 
 from __future__ import annotations
 
@@ -424,7 +424,7 @@ class Actuation:
             self.groups[group] = np.flatnonzero(np.array(groups) == group)
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
-        # Generalised force (6 + n, nu) per unit of each input; zero for the inputs whose
+        # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose
         # generalised force depends on the configuration.
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
         # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
@@ -458,7 +458,7 @@ class Actuation:
         return chart.to_base(self.held, u[..., None])[..., 0]
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return each joint's wrench of thrusters and wheels in its frame; None without any."""
+        """Return the wrench of thrusters and wheels on each joint, in its frame, or None."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())

@@ -1,4 +1,4 @@
-"""Kernel: dynamics and simulation of eight robots at once, compiled if numba is installed.
+"""Kernel: dynamics and simulation of eight robots in one call, compiled if numba is installed.
 
 Imports `base`, `robot` and `dynamics`.
 """

@@ -20,8 +20,8 @@ from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_h
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import called, load, root, store
 
-# Weight of the inputs' magnitudes in the cost: among inputs of equal effect it selects the
-# smallest.
+# Weight of the inputs' magnitudes in the cost. Among solutions with the same effect, it selects the
+# solution with the smallest inputs.
 LEAST = 1e-7
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -34,13 +34,14 @@ class LeastSquares(
     `columns` holds the k columns of generalised force per unit input, one after the other, and then
     the force. The other fields are work space:
 
-    - `given`: the columns and the force of one lane, and `A`: the columns divided by their norm.
-    - `Q`, `R`: QR factors of the columns of the free inputs, with the rows of `LEAST` below them,
-      in the `order` in which the inputs became free.
-    - `b`: the residual, and `y`: its components along `Q`.
+    - `given`: the columns and the force of one lane. `A`: the columns divided by the norm of the
+      matrix that they form.
+    - `Q`, `R`: QR factors of the free inputs' columns, extended by rows that contain `LEAST`.
+      `order`: the free inputs, in the order in which they became free.
+    - `b`: the residual. `y`: its components along `Q`.
     - `wanted`: the force, scaled to length 1.
-    - `s`: the solution without bounds, and `low`, `high`: the scaled bounds.
-    - `state`: whether each input is free, or at which bound.
+    - `s`: the solution without bounds. `low`, `high`: the scaled bounds.
+    - `state`: for each input, whether it is free, at its lower bound or at its upper bound.
     """
 
 
@@ -88,13 +89,13 @@ def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 @vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    """Write the scalar product of each row of `size` entries of a with the first entries of b."""
+    """Write the scalar product of each row (size,) of a with the first `size` entries of b."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
 def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    # Modified Gram-Schmidt. If the right-hand side is treated as the last column of the matrix,
-    # the least squares solution is as accurate as with Householder's method.
+    # Modified Gram-Schmidt. The right-hand side is treated as the last column of the matrix. The
+    # least squares solution is then as accurate as with Householder's method.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)
@@ -126,7 +127,7 @@ def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None
 
 
 def least_squares(least, most, size):
-    """Return a problem with bounds (k,) and forces (size,); its arrays are not laned."""
+    """Return a problem with bounds (k,) and forces (size,), for a single lane."""
     count = len(least)
     lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
     lengths |= {"A": count * size, "Q": count * (size + count), "R": count * count}
@@ -145,7 +146,7 @@ def least_squares(least, most, size):
 def allocate(allocation, point, commanded):
     """Write the inputs whose accelerations are nearest to the accelerations of a command.
 
-    Without an allocation problem, the inputs are the command.
+    If there is no allocation problem, the command is written unchanged.
     """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
@@ -160,7 +161,7 @@ def allocate(allocation, point, commanded):
     turn_held(asking, own)
     push(work, tree, own.pushing)
     vec.copy(work, tree.c, columns, count * size, size)
-    # The generalised force per unit of each input, one input after the other.
+    # Write the generalised force per unit of each input, one input after the other.
     tree = giving.tree
     carried = len(tree.wrench_body)
     for entry in range(len(tree.driven) * size):
@@ -312,7 +313,7 @@ def _fit(problem, size, free, kept):
 
 @called
 def _steepest(problem, size):
-    """Return the untried input whose release reduces the error fastest, or -1 without one."""
+    """Return the untried input whose release reduces the error fastest; -1 if there is none."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A, size, b, slopes)
     for j in range(len(state)):

@@ -15,11 +15,12 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 from fflin.kernel.vectors import load, splat, store
 
-# Offsets of the motion vectors of each body: velocity, Psi', acceleration without c, acceleration
-# by c alone, and Psi''.
+# Offsets of the motion vectors of each body: velocity, Psi', acceleration if c = 0, acceleration
+# that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 # Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
-# moment and force without c, and moment and force by c alone.
+# moment and force (FORCE), and the moment and force that the accelerations c of the subtree's own
+# joints cause (CARRIED). FORCE excludes the effect of c until `accelerate_bodies` adds it.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
@@ -130,7 +131,7 @@ def inwards(work, tree):
 
 
 def factorise(work, tree):
-    """Factorise M = L^T D L: replace the packed M by the unit L, and write 1 / D at `scaled`."""
+    """Factorise M = L^T D L: replace M by the unit triangular L, and write 1 / D at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -156,7 +157,7 @@ def solve_inwards(work, tree, x, first):
 
 
 def solve(work, tree, x):
-    """Replace a force f at x by the acceleration M^-1 f; M must be factorised."""
+    """Replace a force f at the offset x by M^-1 f; M must be factorised."""
     packed = tree.packed
     solve_inwards(work, tree, work, x)
     for k in range(len(tree.row)):
@@ -217,7 +218,7 @@ def motion_cross(velocity, along):
 
 
 def at_joint(work, at, place):
-    """Shift the parent's motion vector at `at` to the origin of a joint."""
+    """Read the parent's motion vector at the offset `at`, and shift it to a joint's origin."""
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
@@ -228,7 +229,7 @@ def at_parent(work, place, force):
 
 
 def move_bodies(work, tree, nu):
-    """Write velocities and accelerations without c, from the base outwards, for v_b = 0."""
+    """Write velocities, and accelerations if c = 0, from the base outwards, for v_b = 0."""
     for entry in range(MOTION):
         store(work, tree.motion + entry, 0.0)
     vec.put3(work, tree.motion, vec.get3(nu, 0))
@@ -247,7 +248,7 @@ def move_bodies(work, tree, nu):
 
 
 def load_bodies(work, tree):
-    """Write the inertial force of each single body, including its gyroscopic torque."""
+    """Write the inertial force of each single body if c = 0, including its gyroscopic torque."""
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD + FORCE
         moving = tree.motion + body * MOTION
@@ -353,7 +354,7 @@ def collect(work, tree):
 
 
 def accelerate_bodies(work, tree):
-    """Add what c contributes to accelerations and Psi'' (outwards), then to forces (inwards)."""
+    """Add the contributions of c to accelerations and Psi'' (outwards) and to forces (inwards)."""
     vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
     for body in range(1, len(tree.parent)):
         at = tree.motion + body * MOTION

@@ -71,7 +71,7 @@ def checked_engine(engine: object) -> str | None:
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Compiled:
     """Return a function of the kernel, whose machine code is stored on disk at its first call."""
-    with _TURN:  # several threads may call at once
+    with _TURN:  # several threads may call this function at the same time
         return _prepared(module, name, what)
 
 
@@ -84,7 +84,7 @@ def _prepared(module: str, name: str, what: str) -> Compiled:
     with _between_processes(folder / f"{module}.{name}.lock"):
         for entry in _stored(folder, module, name)[1]:
             entry.unlink(missing_ok=True)
-    if not isinstance(compiled.compile, partial):  # wrapped twice, the lock would block itself
+    if not isinstance(compiled.compile, partial):  # if wrapped twice, it would wait for itself
         compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
     return compiled
 
@@ -165,7 +165,7 @@ def is_kept(module: str, name: str) -> bool:
 
 
 def _stored(folder: Path, module: str, name: str) -> tuple[list[Path], list[Path]]:
-    """Return the index files of machine code for this Python: newer than all sources, and older."""
+    """Return the machine code's index files for this Python: newer than all sources, and others."""
     # numba checks the age of the function's own file only, not of the files of called functions.
     source = max(file.stat().st_mtime for file in Path(__file__).parent.glob("*.py"))
     newer: list[Path] = []

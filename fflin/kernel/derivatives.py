@@ -1,9 +1,9 @@
 r"""M^-1, accelerations and their derivatives at many points, with eight points per instruction.
 
-RNEA is differentiated in closed form. Let S be the spatial axis of a joint, v and a the velocity
-and acceleration of its parent, Psi' = v x S and Psi'' = a x S + v x Psi'. If joint j is on the path
-from the base to joint i, the derivatives of the joint forces tau with respect to the positions q
-and velocities q' are
+RNEA is differentiated in closed form. Let S be the spatial axis of a joint, and let v and a be the
+velocity and acceleration of its parent. Define Psi' = v x S and Psi'' = a x S + v x Psi'. If joint
+j is on the path from the base to joint i, the derivatives of the joint forces tau with respect to
+the positions q and velocities q' are
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
@@ -11,10 +11,10 @@ and velocities q' are
     \partial\tau_i/\partial q_j &= (2 B_i^T S_i)^T \Psi'_j + (I_i S_i)^T \Psi''_j \\
     \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
 
-where I, B and f are inertia, Coriolis matrix and force of the subtree of joint i. For an angular
-velocity w, 2 B w is the force 2 w x p and the moment 2 (tr G - G) w + w x h. Here p is the momentum
-of the subtree, G = sum m v r^T its first moments of momentum about the joint, and h its stored
-momentum.
+where I_i, B_i and f_i are the inertia, the Coriolis matrix and the force of joint i's subtree. For
+an angular velocity w, 2 B w is the force 2 w x p and the moment 2 (tr G - G) w + w x h. Here p is
+the momentum of the subtree, and h is its stored momentum. G = sum m v r^T are its first moments of
+momentum about the joint.
 
 References
 ----------
@@ -68,7 +68,7 @@ def differentiate(work, tree):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
-    # All forces over each joint, and each joint's force over omega_b.
+    # Derivatives of all forces over each joint, and derivatives of each joint's force over omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         moving = tree.motion + body * MOTION
@@ -106,7 +106,7 @@ def differentiate(work, tree):
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         bodies.add_column(work, tree.lower + column, width, by_q)
         bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
-    # The base's force over omega_b.
+    # Derivatives of the base's force over omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
@@ -116,7 +116,7 @@ def differentiate(work, tree):
 
 
 def _push(work, tree, by_u):
-    """Write the derivatives over the inputs: columns of M^-1, or linear combinations of them."""
+    """Write the acceleration per unit input: a column of M^-1, or a combination of its columns."""
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
     for row in range(size):
         for index in range(count):
@@ -167,7 +167,7 @@ def _unpack(work, start, entries, out, first, offset):
 
 @compiled
 def derive(tree, points, out, lanes, work):
-    """Write the results of `RowAccelerations` at eight or more points, which may be at rest."""
+    """Write the results of `RowAccelerations` at eight or more points; `nu` is empty at rest."""
     q, nu, force, u = points
     c, A, by_u, judged = out
     size = len(tree.row)
@@ -224,9 +224,9 @@ class Packed(namedtuple("Packed", "q nu force u")):
 class RowAccelerations:
     """Accelerations at rows of points, their derivatives and M^-1, by the compiled kernel.
 
-    Its methods return whether (N,) the results are accurate: M is well-conditioned and all angles
-    are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures the accuracy of
-    M^-1; see `dynamics.rnea`.
+    Its methods return a mask (N,) of the points with accurate results. There, M is well-conditioned
+    and all angles are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures
+    the accuracy of M^-1; see `dynamics.rnea`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -244,7 +244,7 @@ class RowAccelerations:
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
     ) -> tuple[Array, Mask]:
-        """Write the derivatives of accelerations; return c (N, 6 + n) as well.
+        """Write the derivatives of the accelerations; return c (N, 6 + n) and the mask.
 
         The lower half of each A (N, nx, nx) gets the derivatives over the state. A and by_u are
         C-contiguous; nu and u are in base axes.

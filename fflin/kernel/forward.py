@@ -28,12 +28,13 @@ class Mechanics(
     """Robot parameters of the loop; each array of doubles may have a second axis of eight lanes.
 
     - `gravity` (3,).
-    - Fields of each joint: its entry of q (`index`); whether this entry is the cosine of an angle
-      (`circling`); the change of the entry per unit of q_m (`scale`, 1 except for modal
-      amplitudes); whether the joint has a spring or damper (`springy`); and the position at which
-      the spring is relaxed (`rest`).
-    - `held`: three inputs form each vector on the base in reference axes; this is the index of the
-      first. `triads`: the same for vectors in any axes.
+    - `index`, `circling`: for each joint, its entry of q, and whether it is the cosine of an angle.
+    - `scale`: for each joint, the change of this entry per unit of q_m. It is 1 except for modal
+      amplitudes.
+    - `springy`, `rest`: for each joint, whether it has a spring or damper, and the position at
+      which the spring is relaxed.
+    - `held`: the index of the first of the three inputs of each torque or force on the base in
+      reference axes. `triads`: the same indices for torques and forces in any axes.
     - `origin` (7,): placement of the world's origin relative to the reference.
     - `faults`: the `ActuatorFaults`.
     """
@@ -106,7 +107,7 @@ def turn_held(robot, point):
 
 
 def push(work, tree, pushing):
-    """Write the generalised force of inputs in base axes at the offset of c."""
+    """Write the generalised force of the inputs `pushing`, in base axes, at the offset of c."""
     size, count = len(tree.row), len(tree.wrench_body)
     for index in range(size):
         store(work, tree.c + index, 0.0)
@@ -150,7 +151,8 @@ def accelerate(work, robot, point, rates, to):
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Offsets in `sums`: impulse and displacement of the centre of mass, up to the step and within it.
+# Offsets in `sums`: the impulse and the displacement of the centre of mass, first up to the current
+# step, then within it.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
@@ -162,7 +164,8 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
       are relative.
     - `weight` (3,): mass times gravity.
     - `sums` (18,): the impulse (6,), and the displacement (3,) of the centre of mass that the
-      impulse causes. The first nine entries are up to the current step, the other nine within it.
+      impulse causes. The first nine entries cover the time up to the current step, the other nine
+      the step itself.
     """
 
 
@@ -188,7 +191,7 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 
 def end_step(reference, h):
-    """Add the sums of a finished step of h [s] to the sums up to now, and set them to zero."""
+    """Add the sums within a finished step of h [s] to the sums up to it, and reset the former."""
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
     shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
@@ -199,7 +202,7 @@ def end_step(reference, h):
 
 
 def kept_at(reference, t):
-    """Return the reference of linear and angular momentum and of the centre of mass."""
+    """Return the reference at a time: (linear, angular) momentum, and centre of mass."""
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
     flown = vec.times(vec.get3(reference.start, 0), t * load(reference.per_mass, 0))
     shift = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, SHIFT))

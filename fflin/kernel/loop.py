@@ -1,7 +1,8 @@
 """The closed loop: policy, actuator channel, steps on the manifold, and statistics of a run.
 
-The channel applies limits, sample and hold, delay, pulses and wheel speeds to the commands of the
-policy. The Python engine and the compiled engine both call its functions; see `control.channel`.
+The channel applies limits, sample and hold, delays, pulses and wheel speed limits to the commands
+of the policy. The Python engine and the compiled engine both call its functions; see
+`control.channel`.
 """
 
 from collections import namedtuple
@@ -104,7 +105,8 @@ def transmit(channel, step, nu, u):
         for index in range(len(pulses.at)):
             level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
             store(u, pulses.at[index], level)
-    # Reduce torques that would make a wheel exceed its speed limit in a step, at most to zero.
+    # If a torque would make a wheel exceed its speed limit in this step, reduce the torque, but do
+    # not reverse it.
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
@@ -130,7 +132,7 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # An impulse that only rounding errors put below the least impulse is fired.
+        # An impulse is also fired if it is below the least impulse only because of rounding errors.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -146,11 +148,11 @@ class Method(
     - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
       each stage. The last row is a second displacement after the last stage.
     - `speed`: rows with the same weights for the velocity after each stage.
-    - `origin`: for each displacement, 0 if it starts at the configuration of the first stage, or 1
-      if it starts at the configuration of the second stage.
+    - `origin`: the stage from whose configuration each displacement starts: 0 for the first stage,
+      1 for the second.
     - `nodes` [s]: times of the stages.
-    - `weights`, `moments`: weights of the stages in an integral and in a double integral over the
-      step, including h and h^2.
+    - `weights`: weights of the stages in an integral over the step, including h. `moments`: their
+      weights in a double integral over the step, including h^2.
     - Work space: v and the accelerations of the stages (`rates`), a displacement (`along`), and q
       at the `first` and the `second` stage.
     - `u` (nu,): inputs at the beginning of the last step.
@@ -158,16 +160,22 @@ class Method(
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
-    """Stop conditions: squared bounds of the rates (6 + n,), and the sign (1,) of q0 in the chart.
+    """Stop conditions: squared limits of the rates (6 + n,), and the sign (1,) that q0 must keep.
 
-    The sign is 0 if there is no chart. In the Python engine, rates are in the order of v (nv,).
+    Here q0 is the scalar part of the base's quaternion relative to the reference. The sign is 0 if
+    the policy uses no chart, so that every attitude is allowed. In the Python engine, rates are in
+    the order of v (nv,).
     """
 
 
 class Arguments(
     namedtuple("Arguments", "robot method law channel reference project pushed stop point")
 ):
-    """Arguments of `advance`, with the switches for the projection and for external forces."""
+    """Arguments of `advance`.
+
+    `project` turns on the projection on the momentum reference (`forward.impose`). `pushed` turns
+    on the integration of external wrenches (`forward.add_wrench`).
+    """
 
 
 ARGUMENTS = Struct(
@@ -197,7 +205,7 @@ def _combine(shares, row, rates, out):
 
 
 def goes_on(stop, origin, q, rates):
-    """Return whether all rates are within finite bounds and the base is within the chart."""
+    """Return whether all rates are within their limits and the base is within the chart."""
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))
     good = below(-(load(stop.sign, 0) * scalar), 1e-300)
@@ -228,12 +236,12 @@ def advance(words, clock, last, every, rows, work):
     `words` represent `Arguments`. The point, the momentum reference, and the memory of policy and
     channel are updated. clock (1,) is the number of finished steps. At the first step, the initial
     momentum and centre of mass are written into the momentum reference. If `every` is not 0, a row
-    is written every `every` steps: q, nu, u, and the reference of momentum (6,) and centre of mass
-    (3,). `work` has `Layout.size` entries.
+    is written every `every` steps. It contains q, nu, u, the reference momentum (6,) and the
+    reference centre of mass (3,). `work` has `Layout.size` entries.
     """
     of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
-    point, h, at = of.point, method.h, 0  # `at` is the place of the next entry in `rows`
+    point, h, at = of.point, method.h, 0  # `at` is the index of the next entry in `rows`
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
@@ -290,8 +298,9 @@ class RunStatistics(
     - `kind` (nx,) is the kind of each state: 0 if it has none, -1 if its error is not recorded.
     - An error has settled when it stays below the fraction `settled` of its largest value, or below
       `tolerance` (kinds,).
-    - At the `steps` (times,), the errors of kinds and states, and the inputs, are recorded.
-    - `at` is work space. The fields after `at` are laned.
+    - Three quantities are recorded at the `steps` (times,): the errors of the kinds, the inputs,
+      and the errors of the states.
+    - `at` is work space. All fields after `at` have one column per lane.
     """
 
 
@@ -346,7 +355,7 @@ def _compare(stats, step):
 
 @compiled
 def take(words, rows, first, count):
-    """Update the statistics with `count` rows of `advance`; the first row is the step `first`.
+    """Update the statistics with `count` rows of `advance`, which begin at the step `first`.
 
     `words` represent `RunStatistics`.
     """

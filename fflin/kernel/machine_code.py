@@ -1,4 +1,4 @@
-"""Compilation of the kernel's functions by numba, with the functions that they call.
+"""Compilation of the kernel's functions, and of the functions that they call, by numba.
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
 machine code for each function together with all functions that it calls. A function at the end of a
@@ -6,10 +6,11 @@ chain of ten calls would be compiled ten times. Here a part (a function called o
 functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
 Python calls.
 
-The operations of `kernel.vectors` are compiled for one number or for eight at once. An array with
-one axis holds numbers. An array with a second axis of eight holds lanes: one robot per lane, and
-one instruction for all eight. A single double stands for eight equal numbers. So a function that is
-written for one number can be compiled for eight.
+The operations of `kernel.vectors` are compiled for one number or for eight numbers. An array with
+one axis holds numbers. An array with a second axis of eight holds lanes: each lane is one robot,
+and one instruction computes all eight. If an operation combines lanes with a double, the double
+stands for eight equal numbers. So a function that is written for one number can be compiled for
+eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
 vector type `Lanes`, whose operations LLVM compiles to vector instructions. If the registers of a
@@ -47,9 +48,9 @@ _DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BYTES = 8  # alignment of a double
 
-# Writes the code of an operation for LLVM values, and returns its result.
+# Function that writes the code of an operation for LLVM values and returns its result.
 Generator: TypeAlias = Callable[..., ir.Value]
-# Returns the signature of an operation for the numba types of its arguments.
+# Function that returns the signature of an operation for the numba types of its arguments.
 Typer: TypeAlias = Callable[..., Signature]
 
 
@@ -83,12 +84,12 @@ def _alike(builder: ir.IRBuilder, *values: ir.Value) -> Sequence[ir.Value]:
 
 
 def _together(*kinds: Type) -> Signature:
-    """Return the signature of an operation whose result has lanes if one of the numbers has."""
+    """Return the signature of an operation whose result has lanes if an operand has lanes."""
     return (lanes if lanes in kinds else float64)(*kinds)
 
 
 def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
-    """Define an operator of Python for lanes, and for lanes with doubles."""
+    """Define an operator of Python for lanes, and for lanes combined with doubles."""
 
     def lowered(
         _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
@@ -114,9 +115,10 @@ OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Decorate a function that generates the code which replaces a function of `kernel.vectors`.
+    """Decorate a generator of the code that replaces a function of `kernel.vectors`.
 
-    The function gets an array as the address of its first entry, a double or a vector.
+    In place of an array, the function gets the address of the array's first entry, which is a
+    double or a vector.
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:
@@ -222,7 +224,7 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
 
 
 class _NoEnvironments:
-    """numba code generator that sets no environment: a part has no machine code to refer to it."""
+    """numba code generator that sets no environment, because a part has no machine code for it."""
 
     def __init__(self, codegen: object) -> None:
         self._codegen = codegen
@@ -241,7 +243,7 @@ class PartLibrary(CPUCodeLibrary):
 
     @property
     def codegen(self) -> _NoEnvironments:
-        """Compiler of this part."""
+        """Code generator of this part."""
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
@@ -260,7 +262,7 @@ class PartLibrary(CPUCodeLibrary):
         return 0
 
     def _called(self, found: dict[CodeLibrary, ir.Module]) -> None:
-        """Add the LLVM code of each called function, without the code that a part calls."""
+        """Add the LLVM code of each function that this part calls, directly or indirectly, once."""
         for library in self._linking_libraries:
             if library not in found:
                 part = isinstance(library, PartLibrary)

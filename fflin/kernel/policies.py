@@ -14,7 +14,7 @@ from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
 from fflin.kernel.vectors import angle, called, chosen, load, splat, store, whole
 
-_NEAR = 1e-9  # times within this fraction of an interval from a knot are taken as the knot
+_NEAR = 1e-9  # a time counts as a knot if it is nearer than this fraction of the interval
 
 
 class Path(
@@ -29,7 +29,7 @@ class Path(
     - `shift`: cubics (4, 6 + n) for the displacement from the knot; `speed`: cubics for nu. Their
       variable is the elapsed fraction of the interval.
     - u is linear between knots, or constant if `hold` is true. It is evaluated `ahead` [s] after
-      the current time. At each index in `held`, three inputs in world axes begin.
+      the current time. Each index in `held` is the first of three inputs in world axes.
     - `K`: polynomials with `order` coefficients in the time since the latest of `starts`. K is
       constant after `last` [s].
     - `along` (6 + n,), the error `e` (nx,) and the followed `point` are work space.
@@ -101,7 +101,7 @@ def _follow(robot, path, t):
 
 
 def error(robot, path, point):
-    """Write the error of a point from the followed point, in the axes of the followed point."""
+    """Write the error of a point relative to the followed point, in the axes of the latter."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
@@ -152,16 +152,16 @@ class Law(
 ):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
-    - `kind`: NOTHING; LINEAR, where u comes from y by `filter`, or by the gains of `grid` if it has
-      joints; or TRACK, where u = u* - K e along `path`.
-    - `x`: the state, followed by the outputs of gyroscopes, which are on the bodies `gyros` (k,).
-      Their axes `gyro_axes` (9 k,) are columns in body axes.
-    - `y` (ny,): the entries `measured` of x, plus a row of `added` (slots, ny). Each sample uses
-      the next row, and the rows repeat.
+    - `kind`: NOTHING, LINEAR or TRACK. LINEAR computes u from y with `grid` if the grid has joints,
+      and else with `filter`. TRACK computes u = u* - K e along `path`.
+    - `x`: the state, followed by the outputs of the gyroscopes. `gyros` (k,): the body of each
+      gyroscope. `gyro_axes` (9 k,): its axes, as columns in body axes.
+    - `y` (ny,): the entries `measured` of x, plus a row of the noise `added` (slots, ny). Each
+      sample uses the next row, and the rows repeat.
     - `turned`: whether omega_b and v_b of the state are in reference axes.
-    - `origin` (rows, 7): placement of the world's origin relative to the pose at which x is 0.
-      `near` (rows, n): positions to which the angles of continuous joints are unwrapped. Both have
-      one row per sample; after the last sample, the last row applies.
+    - `origin` (rows, 7): placement of the world's origin relative to the pose at which q_b and r_b
+      are 0. `near` (rows, n): the angles of continuous joints are unwrapped to be nearest to these
+      positions. Both have one row per sample; after the last sample, the last row applies.
     - `u`: the command, which `allocation` distributes if it has inputs.
     """
 
@@ -175,9 +175,10 @@ class Grid(namedtuple("Grid", "joint first values stride K offset at")):
 
 
 class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
-    """Linear controller u = u0 + C z + D dy with dy = y - y0; rows as in `Law.origin`.
+    """Linear controller u = u0 + C z + D dy with dy = y - y0.
 
-    z (nz,) is the controller state, to which `jump` is added before each evaluation.
+    z (nz,) is the controller state, to which `jump` is added before each evaluation. All arrays but
+    `z` and `rates` have one row per sample, as `Law.origin`.
 
     - In discrete time, A z + B dy is the next state, and `rates` (nz,) is work space.
     - In continuous time, A z + B dy is dz/dt. `rates` (1 + s, nz) stores z at the beginning of the
@@ -281,7 +282,7 @@ def _feed_back_between(robot, law, point):
 
 
 def _corner(grid, corner, lane):
-    """Return a corner of a lane's grid cell as its interpolation weight and its gain's index."""
+    """Return the interpolation weight and the gain index of a corner of a lane's grid cell."""
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1

@@ -24,7 +24,7 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-LANES = 8  # number of points that the kernel evaluates at once
+LANES = 8  # number of points that the kernel evaluates with each instruction
 
 
 def work_space(size: int) -> Array:
@@ -44,7 +44,7 @@ class Kind(NamedTuple):
 
 WHOLE, REAL, FLAG = Kind(np.intp), Kind(np.float64), Kind(np.bool_)
 INDICES, REALS, FLAGS = Kind(np.intp, 1), Kind(np.float64, 1), Kind(np.bool_, 1)
-# Array of doubles whose second axis is the lane.
+# Array of doubles with one column per lane.
 LANED = Kind(np.float64, 2)
 
 _NOTHING = work_space(0)
@@ -56,7 +56,7 @@ T = TypeVar("T", bound=NamedTuple)
 class Struct(Generic[T_co]):
     """Type of a named tuple of kernel arguments.
 
-    `others` are the kinds of single fields, and `groups` lists the fields of a kind, separated by
+    `others` maps a field to its kind. `groups` maps a kind to the names of its fields, separated by
     spaces. All remaining fields are of the kind `rest`.
     """
 
@@ -79,13 +79,13 @@ class Struct(Generic[T_co]):
         self.name = f"Struct({made.__name__})"
 
     def __call__(self, words: T) -> T:
-        """Return the argument: compiled functions take words, and others take the named tuple."""
+        """Return the named tuple unchanged; in compiled code, interpret words as the struct."""
         return words
 
 
 @cache
 def empty(kind: Struct[T]) -> T:
-    """Return a value of a kind with empty arrays and with numbers equal to 0."""
+    """Return the value of a struct in which all arrays are empty and all numbers are 0."""
     parts: list[object] = []
     for of in kind.kinds.values():
         if isinstance(of, Struct):
@@ -136,10 +136,12 @@ def words_of(value: T, kind: Struct[T]) -> NDArray[np.int64]:
     return np.array(words, dtype=np.int64)
 
 
-# Numbers of entries of a body's pose (x, y and z axes, and the origin relative to the parent's
-# origin) and of its inertia (m, m c, I as xx xy xz yy yz zz).
+# PLACE is the number of entries of a body's pose: x axis, y axis, z axis, and origin relative to
+# the parent's origin. INERTIA is the number of entries of its inertia: m, m c, and I as xx xy xz yy
+# yz zz.
 PLACE, INERTIA = 12, 10
-# Numbers of entries of a body's motion and of its subtree's loads; see `kernel.bodies`.
+# Number of entries of a body's motion, and number of entries of its subtree's loads; see
+# `kernel.bodies`.
 MOTION, LOAD = 30, 27
 
 
@@ -152,28 +154,31 @@ class Tree(
         "bias c columns lower held size",
     )
 ):
-    """Kinematic tree with its loads. Body 0 is the base; the coordinates 0 to 5 are the base's.
+    """Kinematic tree with its loads. Body 0 is the base, which has the coordinates 0 to 5.
 
     Bodies are in Pinocchio's order, coordinates in state order. Fields of each body:
 
     - `parent`: its parent body.
-    - `fixed` (12): rotation columns and origin of its joint in the parent, with z along the axis.
+    - `fixed` (12): pose of its joint in the parent: the three columns of the rotation, and the
+      origin. z is along the joint axis.
     - `index`, `unbounded`: the index of its joint in q, and whether q has the cosine of an angle
       there.
     - `turns`, `slides`: rotation about z and translation along z per unit of the joint coordinate.
     - `bodies` (10): m, m c, and inertia about the joint's origin as xx xy xz yy yz zz. It has a
-      second axis of 8 if lanes differ.
+      second axis of 8 if the inertias of the lanes differ.
     - `axes`: rotation from the axes of `fixed` to Pinocchio's joint axes.
-    - `coordinate`, `factor`: the coordinate that moves the joint, and the motion per unit of it.
+    - `coordinate`, `factor`: the coordinate that moves the joint, and the joint's motion per unit
+      of this coordinate.
 
     `armature` is the inertia of rotors on the diagonal of M. Fields of the packed M:
 
     - `row`, `depth`: offset of each row, and the number of its entries before the diagonal.
     - `path`: the coordinate of each entry.
     - `common`: the number of coordinates that two rows have in common.
-    - `target`, `share`: for each pair of a body and a body on its path inwards, the entry to which
-      the pair contributes, and the factor of the contribution. After the pairs of a body comes the
-      first of the base's six entries in its row.
+    - `target`, `share`: one value for each pair of a body and a body on its path to the base.
+      `target` is the entry of M to which the pair contributes, `share` the factor of the
+      contribution. After the pairs of a body, `target` holds the first of the six entries that
+      couple the body to the base.
 
     Fields of the loads:
 
@@ -203,7 +208,7 @@ _TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
 
 
 def batch_tree(robot: Robot) -> Tree | None:
-    """Return a robot's tree; None in orbit, or if a joint is not a screw about a fixed axis."""
+    """Return a robot's tree; None in orbit, or if a joint is not a screw about a constant axis."""
     if robot not in _TREES:
         _TREES[robot] = _tree(robot)
     return _TREES[robot]
@@ -294,7 +299,10 @@ def _tree(robot: Robot) -> Tree | None:
 
 
 def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, float] | None:
-    """Return the frame with z along a joint's axis, and its rotation and translation per unit."""
+    """Return a frame with z along a joint's axis, the joint's rotation and translation per unit.
+
+    Return None if the joint is not a screw about a constant axis.
+    """
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
     joint.calc(data, q)
@@ -315,7 +323,7 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return the columns of each row of the factor, ending with its diagonal."""
+    """Return the column indices of each row of the factor; the last one is the diagonal."""
     # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
     # branches. Fill-in during the factorisation joins the coordinates of these ancestors to one
     # path (Liu's elimination tree).

@@ -1,9 +1,9 @@
 """Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
 
-A function of the kernel is a Python function. Called directly, with arrays or lists of one axis, it
-computes one number at a time. The Python engine calls it like this, and a debugger can step through
-it. `kernel.machine_code` compiles the same function, also for arrays with a second axis of eight
-lanes. In compiled code, other operations of `kernel.machine_code` replace the operations below.
+A function of the kernel is a Python function. The Python engine calls it directly, with arrays or
+lists of one axis. It then computes one number at a time, and a debugger can step through it.
+`kernel.machine_code` compiles the same function, also for arrays with a second axis of eight lanes.
+In compiled code, other operations of `kernel.machine_code` replace the operations below.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: the base's rotation and translation in base axes, then the
@@ -24,7 +24,7 @@ _TERMS = 10  # exact to machine precision up to half a turn; a step rotates by l
 
 F = TypeVar("F", bound=Callable[..., object])
 
-# One number; in compiled code also eight lanes.
+# One number; in compiled code, one number or eight lanes.
 Number: TypeAlias = float
 # Numbers in memory. The entries of a list are read faster than the entries of an array.
 Entries: TypeAlias = Array | list[Number]
@@ -36,7 +36,7 @@ LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Decorate a function that is rarely called: it is not inlined, which would take long."""
+    """Decorate a rarely called function, which is not inlined to save compilation time."""
     HOW[function] = "called"
     return function
 
@@ -66,7 +66,7 @@ def load(array: Entries, index: int) -> Number:
 
 
 def store(array: Entries, index: int, value: Number) -> None:
-    """Write a number or lanes at an index."""
+    """Write one number, or one number per lane, at an index."""
     array[index] = value
 
 
@@ -117,18 +117,18 @@ def put3(work, at, a):
 
 
 def copy(source, first, target, to, count):
-    """Copy entries."""
+    """Copy `count` entries."""
     for index in range(count):
         store(target, to + index, load(source, first + index))
 
 
 def add(work, at, value):
-    """Add to an entry."""
+    """Add a value to an entry."""
     store(work, at, load(work, at) + value)
 
 
 def add3(work, at, a):
-    """Add to a vector."""
+    """Add a vector to three entries."""
     add(work, at, a[0])
     add(work, at + 1, a[1])
     add(work, at + 2, a[2])
@@ -146,7 +146,7 @@ def put6(work, at, s):
 
 
 def add6(work, at, s):
-    """Add to a spatial vector."""
+    """Add a spatial vector to six entries."""
     add3(work, at, s[0])
     add3(work, at + 3, s[1])
 
@@ -283,7 +283,7 @@ def columns_of(quaternion):
 
 
 def attitude(q, at=0):
-    """Return the base's quaternion at a configuration, which begins at an index."""
+    """Return the base's quaternion of the configuration that begins at the index `at`."""
     return get3(q, at + 3), load(q, at + 6)
 
 
