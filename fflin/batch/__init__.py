@@ -1,4 +1,4 @@
-"""Sweeps: linear models and gains about many points, on threads or worker processes.
+"""Sweeps: linear models and gains about many points, computed on threads or worker processes.
 
 `run` applies a job to rows, chunk by chunk, on threads or worker processes. Results go into a store
 of `files`, from which a run resumes after a crash. In a `sweep`, the rows are `configurations`. The
