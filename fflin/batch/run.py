@@ -276,7 +276,7 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         self._ended = ""  # reason why no further process can start
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
-        """Call a function in a worker process; the call fails if the process dies."""
+        """Call a function in a worker process; its future raises `FflinError` if that dies."""
         return super().submit(self._do, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

@@ -32,20 +32,20 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# _PILOTS is the number of runs per trial level in the search for the largest level. _HALVINGS is
-# the largest number of halvings.
+# The search for the largest level simulates _PILOTS runs at each trial level, and halves the level
+# at most _HALVINGS times.
 _PILOTS, _HALVINGS = 16, 40
-# Largest errors of a start: attitude [deg], revolute joint [rad], and position or prismatic joint
-# [m].
+# Largest initial errors: of the attitude [deg], of a revolute joint [rad], and of the position or a
+# prismatic joint [m].
 _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, nx) with W W' a generalised inverse of P, for a P with mixed units.
+    """Return W (nx, nx) such that W W' is a generalised inverse of P.
 
-    P is scaled to a unit diagonal, and W contains the symmetric root of its pseudoinverse.
-    Eigenvectors are not unique, so errors drawn along them would depend on the processor's
-    rounding.
+    P is first scaled to a unit diagonal, because its states have different units. W then contains
+    the symmetric square root of the pseudoinverse of P, because this root is unique. Eigenvectors
+    are not unique, so errors drawn along them would depend on rounding.
     """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -405,7 +405,8 @@ def _tested(
 ) -> tuple[float, Array]:
     """Return the largest level tested at a knot, and the outcomes (samples,) up to this level.
 
-    About one run in 16 fails at the largest level. P (nx, nx) is the matrix of the level.
+    The largest level is chosen such that about one run in 16 fails at this level. P (nx, nx) is the
+    matrix of the level.
     """
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
@@ -423,9 +424,10 @@ def _tested(
         np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
         *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
     ]
-    # `root` is the square root of a level; at `widest`, a start has one of the largest errors.
+    # `root` is the square root of a level. At `widest`, an error on the ellipsoid reaches one of
+    # the largest initial errors.
     root = widest = float(1.0 / max(reach))
-    # If the goal is missed even without an error, the widest level is tested.
+    # If the run without an initial error already misses the goal, the widest level is tested.
     if not simulate(np.zeros(1)).any():
         for _ in range(_HALVINGS):
             if not simulate(np.full(_PILOTS, root)).any():
@@ -452,14 +454,14 @@ def runs_from(
     policy = replace(
         feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
     )
-    # The chart is centred at the knot, because its attitude may be any rotation. Histories have
-    # entries at the start and at the end.
+    # The attitude at the knot can be any rotation, so the chart is centred at this attitude.
+    # Histories have two entries, at the start and at the end.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
 def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
-    """Return {kind: largest error} from a given mapping, or raise `InputError`."""
+    """Return the checked bounds {kind: largest error}, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in validation.by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
