@@ -24,7 +24,7 @@ from fflin.robot.robot import Robot
 # any other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
 Column: TypeAlias = tuple[int, int, float]
 
-# Number of rows that are checked together, which limits the memory for intermediate results.
+# Rows are checked in blocks of this size, which limits the memory for intermediate results.
 _BLOCK = 2048
 
 # Random rows are drawn in blocks of this size, each with its own seed. A row therefore does not
@@ -278,7 +278,10 @@ def positions(q: Array, columns: Sequence[Column]) -> Array:
 
 
 def away(q: Array, column: Column, value: float) -> Array:
-    """Return distances (N,) of a joint from a value; a continuous joint uses the shorter arc."""
+    """Return the distances (N,) of a joint's values from `value`.
+
+    For a continuous joint, the distance is the length of the shorter arc.
+    """
     distance = values(q, column) - value
     if column[1] >= 0:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))

@@ -1,4 +1,4 @@
-"""Linear quadratic regulators about many points, and gain scheduling between them."""
+"""Linear quadratic regulators about many points, and gain scheduling between these points."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # Placement of a free-flyer joint that coincides with the root frame: position and quaternion.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
-# Joint values that differ by at most this count as equal [rad|m].
+# Joint values count as equal if they differ by at most this [rad|m].
 _SAME = 1e-9
 
 

@@ -1,4 +1,4 @@
-"""Campaign: the outcomes of its runs, and statistics with confidence intervals."""
+"""Campaign: outcomes of Monte Carlo runs, and statistics with confidence intervals."""
 
 from __future__ import annotations
 

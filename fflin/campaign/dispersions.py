@@ -1,4 +1,4 @@
-"""Dispersions: random values by name, and the robots and initial states that follow from them."""
+"""Dispersions: named random values, which determine the robot and initial state of each run."""
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +34,7 @@ from fflin.simulation.plan import Times
 from fflin.simulation.run import Plant
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
-# Axes of the kinds of dispersions that have a value for each axis.
+# Names of the axes, for the kinds of dispersions that have one value per axis.
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -43,7 +43,7 @@ _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """Random value of each run, and the quantities that this value changes."""
+    """Random variable with one value per run, and the quantities that this value changes."""
 
     name: str
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
@@ -53,7 +53,7 @@ class Column(NamedTuple):
 
 
 class Dispersions:
-    """Dispersions of `monte_carlo`: random values, and the runs' robots and initial states."""
+    """Dispersions of `monte_carlo`, which draw the robot and initial state of each run."""
 
     def __init__(
         self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
@@ -70,7 +70,7 @@ class Dispersions:
         elif isinstance(reads, TrajectoryOutputFeedback):
             sensors = reads.filter.output_names
         modes = tuple(each.name for each in robot.modes)
-        # Names of the quantities of each kind.
+        # {kind of dispersion: names of the quantities that can be dispersed}.
         self._known: dict[str, tuple[str, ...]] = {
             **dict.fromkeys(_OF_SENSORS, sensors),
             **dict.fromkeys(_OF_BODIES, tuple(robot.pieces)),
@@ -249,7 +249,7 @@ class Dispersions:
             said = f"an invalid initial attitude is drawn in the runs from {start} on"
             try:
                 self.starts(drawn)
-                # A drawn inertia may be too small for the flexible modes of its body.
+                # A drawn inertia can be too small for the flexible modes of its body.
                 if appendages := self._plant.robot.appendages:
                     refused = first_impossible(self._model, appendages, self.bodies(drawn))
                     if refused is not None:
@@ -381,7 +381,7 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Function that creates a policy for a robot, and the linear model of its design, if any."""
+    """Policy that is bound to a robot by the function `bind`; `lin` is the model of its design."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None

@@ -386,9 +386,10 @@ def funnel(
 def _outcomes(
     final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the codes of `Funnel.outcomes` for bounds on final errors and on errors at any time.
+    """Return the codes of the outcomes of runs; see `Funnel.outcomes`.
 
-    P (nx, nx) is the matrix of the final level.
+    `final` contains bounds of the final errors, and `within` contains bounds of the errors at all
+    times. P (nx, nx) is the matrix of the final level.
     """
     e = runs["state_errors"][:, -1]
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
@@ -403,7 +404,7 @@ def _outcomes(
 def _tested(
     job: CampaignJob, P: Array, samples: int, rng: np.random.Generator, how: Execution
 ) -> tuple[float, Array]:
-    """Return the largest level tested at a knot, and the outcomes (samples,) up to this level.
+    """Return the largest level tested at a knot, and the outcomes (samples,) up to that level.
 
     The largest level is chosen such that about one run in 16 fails at this level. P (nx, nx) is the
     matrix of the level.
@@ -411,7 +412,7 @@ def _tested(
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
     def simulate(roots: Array) -> Array:
-        """Return the outcomes of runs from random errors e (N, nx) with sqrt(e' P e) = roots."""
+        """Simulate runs from random errors e with sqrt(e' P e) = `roots`; return the outcomes."""
         e = rng.normal(size=(len(roots), len(P))) @ W.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
@@ -447,7 +448,7 @@ def runs_from(
     options: Mapping[str, object],
     judge: Judge | None = None,
 ) -> CampaignJob:
-    """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
+    """Return a job for runs that start at knot k of the trajectory (`first` of the schedule)."""
     motion, schedule = feedback.trajectory, feedback.schedule
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
@@ -479,7 +480,7 @@ def _shown(bounds: Mapping[str, float]) -> str:
 def _indices(
     motion: Trajectory, by: GainSchedule, knots: int | Sequence[float]
 ) -> list[tuple[int, int]]:
-    """Return the indices of the chosen knots in the trajectory and in the schedule."""
+    """Return (index in the trajectory, index in the schedule) of each chosen knot."""
     t, own = motion.t - motion.t[0], by.t - by.t[0]
     at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)
     both = np.flatnonzero(np.abs(own[at] - t) <= 1e-6 * (by.dt or t[-1]))

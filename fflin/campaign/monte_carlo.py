@@ -268,7 +268,7 @@ def _require_sendable(job: CampaignJob) -> None:
 
 
 def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
-    """Return the goals; raise an error for a goal that an empty campaign cannot evaluate."""
+    """Return the goals; each is evaluated on the empty campaign `none` to find invalid goals."""
     listed = [given] if isinstance(given, str) else given
     goals: list[str] = [
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),

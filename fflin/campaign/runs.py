@@ -103,7 +103,7 @@ def kinds_of(state: StateMap) -> Indices:
 
 
 class CampaignJob:
-    """Runs of one plan, each with its own drawn values; see `batch.run.Job`.
+    """Job for runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
     Without dispersions, the drawn values are the deviations of the initial state. A `judge` can end
     runs early; the job then returns the results of the judge, not the arrays of a `Campaign`.

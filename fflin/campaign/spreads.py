@@ -1,4 +1,4 @@
-"""Spreads of random values, from Python or a TOML file, as inverse distribution functions."""
+"""Spreads of random values, given in Python or a TOML file, and their inverse distributions."""
 
 import reprlib
 from collections.abc import Callable, Iterator, Mapping

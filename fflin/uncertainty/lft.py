@@ -203,7 +203,7 @@ class LFT(Design):
 
 
 class Range(NamedTuple):
-    """Range of a parameter: the parameter, its middle value and half width."""
+    """Parameter with the middle value and the half width of its range."""
 
     parameter: Parameter
     middle: float
@@ -235,7 +235,7 @@ _MOST = 6
 def linear_fractional(
     lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
 ) -> LFT:
-    """Return the LFT of a model about a point at rest without forces."""
+    """Return the LFT of a model about an operating point at rest, without forces."""
     form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
     # Parameters of the same link or mode multiply each other's signals, so each link or mode is
     # added with all its parameters: {(link or mode, joint): {part: index of the parameter}}.

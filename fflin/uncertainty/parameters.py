@@ -124,7 +124,7 @@ class Parameters(dict[str, Parameter]):
         return robot.replace(**changed) if changed else robot
 
     def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return {owner: {part: value}} from {parameter: value}."""
+        """Convert {parameter: value} to {owner: {part: value}}."""
         found: dict[str, dict[str, float]] = {}
         for name, value in values.items():
             found.setdefault(self[name].of, {})[self[name].part] = value

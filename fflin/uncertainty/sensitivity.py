@@ -282,7 +282,7 @@ class Sensitivity:
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
-    """Return the entries of a file for a `Sensitivity`."""
+    """Return the entries that a file stores for a `Sensitivity`."""
     every = found.parameters.values()
     return record_of(found.lin) | {
         "parameters": list(found.names),

@@ -327,7 +327,7 @@ def _range(one: Parameter, value: object) -> Range:
 
 
 def _tied(key: str, ranges: list[Range], value: object) -> Block:
-    """Return the block of tied parameters, which have a common delta."""
+    """Return the block of several tied parameters, which one delta varies."""
     units = {each.parameter.unit for each in ranges}
     if isinstance(value, tuple | list):
         if len(units) > 1:

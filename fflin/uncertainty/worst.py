@@ -31,8 +31,8 @@ _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# Largest number of signals for which slycot is used. Its time grows with the fifth power of this
-# number.
+# Largest number of signals for which slycot is used, because the time that slycot takes grows with
+# the fifth power of the number of signals.
 _SIGNALS = 24
 # _LOOK is the number of frequencies in the first grid. _INSIDE is the number of frequencies checked
 # in an interval. Each of at most _DIVISIONS steps divides an interval or calls slycot.
@@ -163,7 +163,7 @@ class Gain(NamedTuple):
 
 
 class Loops:
-    """Closed loops of an LFT with u = -K x, at rows of deltas (N, k)."""
+    """Closed loops of an LFT with u = -K x; each row of deltas (N, k) gives one loop."""
 
     def __init__(self, lft: LFT, K: Array) -> None:
         self.lft, self.K = lft, K
