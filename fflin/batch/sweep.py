@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
-# Usual and smallest size of a chunk's result [bytes], and limits of the number of rows in a chunk.
-# Large chunks take much longer to compute than to send; several small ones fit into memory.
+# Limits of the size of a chunk's result [bytes] and of its number of rows. A chunk must take much
+# longer to compute than to send, and several chunks must fit into memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
@@ -222,8 +222,8 @@ class ChunkJob:
         self.threaded = self._kernel is not None
         self._data = robot.create_data()
         self._inertia = Inertia(prepared.map, self._data)
-        # Let the robot be at rest, without external forces, and each point its own reference. Then
-        # A and f0 are the same at all points, so only B is computed.
+        # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
+        # each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
         nx, nu = prepared.map.nx, len(prepared.actuation.names)
         ny = len(prepared.common["output_names"])
@@ -295,7 +295,7 @@ class ChunkJob:
     def _write_anywhere(
         self, kernel: RowAccelerations, rows: Rows, out: Mapping[str, Array]
     ) -> Mask:
-        """Write the models about points in motion or with inputs; return a mask of valid rows."""
+        """Write the models about points of any kind, and return the mask of valid rows."""
         ready, q, A, B = self.linearizer.prepared, rows["q"], out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
         own = ready.own_reference

@@ -299,7 +299,7 @@ class CampaignJob:
         return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
-        """Repeat the run with the drawn values (k,), bit for bit, and return its motion."""
+        """Repeat the run with the drawn values (k,), by the same engine, and return its motion."""
         plan = self.plan_of(drawn)
         if self.engine == "python":
             run = _recorded(plan, plan.times.every)
@@ -398,7 +398,7 @@ class RunStatistics(lanes.Statistics):
 
 
 def _by_run(values: Array, *shape: int) -> Array:
-    """Convert values (.., LANES), whose last axis is the run, to rows (LANES, *shape)."""
+    """Convert values (.., LANES), with the runs along the last axis, to rows (LANES, *shape)."""
     shape = shape or (len(values),)
     return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
 

@@ -33,7 +33,7 @@ class DispersionFile(dict[str, object]):
 
 
 def placed(dispersions: object) -> AbstractContextManager[None]:
-    """Return a context that adds the file and line to an error about a spread."""
+    """Return a context manager that adds the file and line to errors about a spread."""
     if isinstance(dispersions, DispersionFile):
         return dispersions.document.located(_TABLE)
     return nullcontext()
@@ -209,5 +209,5 @@ def _whole(end: float, u: Array) -> Array:
     return np.floor(end * u)
 
 
-# Distribution of the seeds of noise: whole numbers below 2^53, which doubles represent exactly.
+# Inverse distribution of the noise seeds: whole numbers below 2^53, which are exact as doubles.
 SEEDS = partial(_whole, 2.0**53)

@@ -337,7 +337,7 @@ def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
 
 
 def joint_unit(lin: LinearModel) -> str:
-    """Return the unit of the joints, which is "rad|m" for both revolute and prismatic joints."""
+    """Return the unit of the joints; it is "rad|m" if the model has joints of both kinds."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
     of = {unit for name, unit in pairs if name.startswith("q_m.")}
     return of.pop() if len(of) == 1 else "rad|m"

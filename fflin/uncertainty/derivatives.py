@@ -270,9 +270,10 @@ class ModelDerivatives:
         return self._state.project(by_q)[:, 6:]
 
     def _over_force(self, one: Parameter) -> AccelerationDerivatives:
-        """Return the change of the rates per unit of a parameter that changes no body.
+        """Return the derivatives of the rates with respect to a parameter that changes no body.
 
-        Such a parameter changes a spring, a damper or the wrench of an input.
+        The rates are the accelerations and their derivatives. The parameter changes a spring, a
+        damper or the wrench of an input.
         """
         state, u, size = self._state, self._u, len(self._inverse)
         F: Array = np.zeros(size)
