@@ -2,7 +2,7 @@
 
 An HDF5 file has one dataset per array, and two datasets of checksums. ``chunk_sha256`` contains the
 checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
-``sha256`` is a single checksum of ``chunk_sha256`` and all content that has no rows.
+``sha256`` is one checksum of ``chunk_sha256`` and of all content without rows.
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ def file_checksum(
 def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
-    """Return arrays, names of arrays without rows, strings, and whether checksums were verified.
+    """Return arrays, names of constant arrays, strings, and whether checksums were verified.
 
-    An array without rows is a value that applies to all points.
+    A constant array is stored without rows, because its value is the same at all points.
     """
     writing.check_ending(path, FORMATS)
     arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)

@@ -281,9 +281,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        # Do not join the threads, because a join could block forever. If Ctrl-C interrupts a wait
-        # for a future, the future stays locked, and the thread that sets its result never ends.
-        # All other threads end with their processes.
+        # Do not join the threads, because a join could block forever: if Ctrl-C interrupts a wait
+        # for a future, the future stays locked. The thread that must set its result then never
+        # ends. All other threads end with their processes.
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
             self._ended = "the workers have been shut down"

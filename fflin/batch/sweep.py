@@ -340,7 +340,7 @@ class SweepTask:
         # velocity or input for all points is broadcast to rows.
         self._points, self._known = None, dict[str, Array]()
         if isinstance(q, Grid | RandomConfigurations):
-            # The points may be made for a robot with other inputs or outputs, but the same joints.
+            # The robot of the points can have other inputs or outputs, but must have equal joints.
             if q.robot.joints != robot.joints:
                 raise InputError(
                     f"q was made for '{q.robot.name}', whose joints differ from the joints of "

@@ -110,7 +110,7 @@ class Dispersions:
         self.names = tuple(column.name for column in self.columns)
         # Cached values of slow distributions: {(name, block of runs): values}.
         self._kept: dict[tuple[str, int], Array] = {}
-        # No mass may be dispersed twice: once for a link, and again for the body of this link.
+        # A mass must not be dispersed twice: once for a link, and again for the link's body.
         pieces = [*robot.pieces.values()]
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
@@ -328,8 +328,8 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # In the tree, the parameters of a body include its wheels. So the change of the
-                # body is added, and not the changed body inserted.
+                # The changed body does not include its wheels, but the parameters in the tree do.
+                # So only the change of the body is added to them.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:

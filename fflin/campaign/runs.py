@@ -149,8 +149,8 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # `outcome_shapes` are the shapes, per run, of the arrays of an outcome; a run without steps
-        # gives them. `shapes` are the shapes, per run, of the arrays that the job returns.
+        # `outcome_shapes` has the shape, per run, of each array of an outcome; it is read from the
+        # outcome of a run without steps. `shapes` has the shapes of the arrays of the job's result.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
         self.outcome_shapes = {key: x.shape for key, x in self.outcome(none).items()}

@@ -87,8 +87,8 @@ class Loop:
 
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # The weight of a coordinate is the weight of its rate times the decay rate of the loop. Some
-        # rates have no coordinate among the states of the model.
+        # The weight of a coordinate is the weight of its rate times the decay rate of the loop. For
+        # some rates, the model has no coordinate.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
