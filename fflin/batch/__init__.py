@@ -1,8 +1,8 @@
-"""Sweeps: linear models and gains about many points, on threads or worker processes.
+"""Sweeps: linear models and gains about many points, computed on threads or worker processes.
 
-`run` applies a job to rows, chunk by chunk, on threads or worker processes. Results go into a store
-of `files`, from which a run resumes after a crash. In a `sweep`, the rows are `configurations`. The
-result is a `linear_batch`; `gains` designs regulators for its points.
+`run` applies a job to rows, chunk by chunk, on threads or worker processes. It saves the results in
+a store of `files`; after a crash, the same call resumes from this store. In a `sweep`, the rows are
+`configurations`, and the result is a `linear_batch`. `gains` designs regulators for its points.
 
 Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

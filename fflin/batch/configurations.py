@@ -1,6 +1,6 @@
-"""Points of sweeps: configurations from an array, a grid or at random, velocities and inputs.
+"""Points of sweeps: configurations, velocities and inputs.
 
-The configurations of a grid, and random configurations, are generated on demand.
+Configurations are given as an array, or generated on demand by a grid or a random generator.
 """
 
 import math
@@ -20,11 +20,11 @@ from fflin.robot.fields import travel_of
 from fflin.robot.joints import ROUND_OFF, Joint, by_joint
 from fflin.robot.robot import Robot
 
-# Two indices of a joint in q, and a factor. A continuous joint has the indices of (cos, sin); any
-# other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
+# Two indices into q for a joint, and a factor. A continuous joint has the indices of (cos, sin);
+# any other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
 Column: TypeAlias = tuple[int, int, float]
 
-# Number of rows that are checked together, which limits the memory for intermediate results.
+# Rows are checked in blocks of this size, which limits the memory for intermediate results.
 _BLOCK = 2048
 
 # Random rows are drawn in blocks of this size, each with its own seed. A row therefore does not
@@ -256,7 +256,7 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
 
 
 def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
-    """Return copies (count, nq) of `start` with other values of the named joints."""
+    """Return copies (count, nq) of `start`, in which the named joints have the given `values`."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
         robot.joint(name).place(q.T, column)
@@ -278,7 +278,10 @@ def positions(q: Array, columns: Sequence[Column]) -> Array:
 
 
 def away(q: Array, column: Column, value: float) -> Array:
-    """Return distances (N,) of a joint from a value; a continuous joint uses the shorter arc."""
+    """Return the distances (N,) of a joint's values from `value`.
+
+    For a continuous joint, the distance is the length of the shorter arc.
+    """
     distance = values(q, column) - value
     if column[1] >= 0:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
@@ -286,7 +289,7 @@ def away(q: Array, column: Column, value: float) -> Array:
 
 
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
-    """Return a copy of configurations (N, nq) after `Robot.checked_configuration` of each row."""
+    """Return a copy of configurations (N, nq) that satisfy `Robot.checked_configuration`."""
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
@@ -319,9 +322,10 @@ def checked_rows(
     *,
     every: bool = False,
 ) -> Array:
-    """Return read-only rows (count, size) from an array (count, size), or (size,) for all points.
+    """Return read-only rows (count, size) from such an array, or from one row for all points.
 
-    Rows with an entry that is not finite are checked, or `every` row.
+    The function `check` is called for each row with an entry that is not finite. If `every` is
+    true, it is called for all rows.
     """
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))

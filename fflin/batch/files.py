@@ -1,8 +1,8 @@
 """Arrays of many rows in memory, in .npz files, and in HDF5 files that are read on demand.
 
-An HDF5 file has a dataset for each array and two datasets of checksums. ``chunk_sha256`` contains
-the checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
-``sha256`` is the checksum of these checksums and of all other content.
+An HDF5 file has one dataset per array, and two datasets of checksums. ``chunk_sha256`` contains the
+checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
+``sha256`` is one checksum of ``chunk_sha256`` and of all content without rows.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 FORMATS = (".npz", ".h5")
 
-# HDF5 has checksums of its own metadata from this version on. Without them, reading a damaged file
-# can crash the process.
+# From this version on, HDF5 adds checksums to its own metadata. Without them, reading a damaged
+# file can crash the process.
 CHECKED = ("v108", "v108")
 
 CHUNK_CHECKSUMS = f"chunk_{CHECKSUM}"
@@ -58,7 +58,7 @@ def is_constant(array: Array) -> bool:
 def write_rows(
     path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
-    """Write arrays with the same number of rows, and strings, with digests if `checksummed`."""
+    """Write strings, and arrays of equal length, to a file; add checksums if `checksummed`."""
     writing.check_ending(path, FORMATS)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
@@ -91,7 +91,7 @@ def _checksum(entries: Mapping[str, object]) -> NDArray[np.uint8]:
 
 
 def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uint8]:
-    """Return the SHA-256 digest (chunks, 32) of each chunk of rows."""
+    """Return the SHA-256 digests (chunks, 32) of the chunks of rows."""
 
     def checksum(start: int) -> NDArray[np.uint8]:
         return _checksum({key: value[start : start + chunk] for key, value in varying.items()})
@@ -112,7 +112,10 @@ def file_checksum(
 def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
-    """Return arrays, names of the arrays with one row for all points, strings, and `verified`."""
+    """Return arrays, names of constant arrays, strings, and whether checksums were verified.
+
+    A constant array is stored without rows, because its value is the same at all points.
+    """
     writing.check_ending(path, FORMATS)
     arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)
     return arrays, json.loads(texts["constant"]), texts, verified
@@ -149,7 +152,7 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
 
 
 def _mapped(path: Path, dataset: h5py.Dataset) -> Array:
-    """Return a contiguous dataset as a memory-mapped array."""
+    """Return a dataset as an array, which is memory-mapped if the data are contiguous."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:
         return np.asarray(dataset[()])
@@ -192,7 +195,7 @@ class MemoryStore:
         return self.view(0, stop, self.arrays)
 
     def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
-        """Return arrays in which the results of a chunk are computed: views of the named arrays."""
+        """Return views of the chunk's rows of the named arrays, for the results of a job."""
         return {key: self.arrays[key][start:stop] for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -212,7 +215,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """Arrays of `count` rows in an HDF5 file; the file is named NAME.part until it is complete."""
+    """Arrays of `count` rows in an HDF5 file, which is named NAME.part until it is complete."""
 
     def __init__(
         self,
@@ -264,7 +267,7 @@ class FileStore:
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
-        """Turn errors of HDF5 into a `FileError`."""
+        """Raise `FileError` instead of the errors of HDF5."""
         try:
             yield
         except FileError:
@@ -288,7 +291,7 @@ class FileStore:
             return {key: self._file[key][:stop] for key in self._shapes}
 
     def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
-        """Return arrays in which the results of a chunk are computed; `write` copies them."""
+        """Return uninitialised arrays for a chunk's results, which `write` copies to the file."""
         return {key: np.empty((stop - start, *self._shapes[key])) for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -310,7 +313,7 @@ class FileStore:
             )
             self._file.close()
             writing.install(self.part, self.path)
-        # This call has just written the file, so its checksums are not verified.
+        # This call has written or verified every chunk, so no checksum is verified again.
         return read_rows(self.path, verify=False)[0]
 
     def discard(self) -> None:
@@ -352,7 +355,7 @@ def require_room(path: Path, size: int) -> None:
 
 
 def output_path(out: str | Path) -> Path:
-    """Return a path that can be written as a rows file, or raise `FileError`."""
+    """Return the path of an output file, or raise an error if the file cannot be written."""
     path = writing.as_path(out)
     writing.check_ending(path, FORMATS)
     if path.suffix == ".h5":
@@ -363,6 +366,6 @@ def output_path(out: str | Path) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Return the path NAME.part of an unfinished result, with links followed."""
+    """Return the path NAME.part of an unfinished result, next to the target of a symbolic link."""
     real = Path(os.path.realpath(path)) if os.path.islink(path) else path
     return real.with_name(real.name + ".part")

@@ -1,4 +1,4 @@
-"""Linear quadratic regulators about many points, and gain scheduling between them."""
+"""Linear quadratic regulators about many points, and gain scheduling between these points."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class GainBatch(Design):
     def _interpolator(self) -> RegularGridInterpolator:
         from scipy.interpolate import RegularGridInterpolator
 
-        # If the rows of a full grid are sorted by joint positions, the last joint varies fastest.
+        # The interpolator needs the last joint to vary fastest, so the rows are sorted.
         order = np.lexsort(self.joint_positions.T[::-1])
         shape = [len(values) for values in self._axes.values()]
         K = self.K[order].reshape(*shape, *self.K.shape[1:])
@@ -168,7 +168,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     nv, nu = batch.B_lower.shape[1:]
     K: Array = np.empty((len(batch), nu, 2 * nv))
     residual, margin = np.empty((2, len(batch)))
-    # At rest, every state is regulated and the point is an equilibrium.
+    # About points at rest, A and f0 are the same at all points. If f0 is also zero, the points are
+    # equilibria.
     at_rest = is_constant(batch.A) and is_constant(batch.f0) and not batch.f0[0].any()
     direct = at_rest and nu >= nv
     for index, L in enumerate(batch.B_lower):

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
-# Position and quaternion of a free-flyer joint at the robot's root frame.
+# Placement of a free-flyer joint that coincides with the root frame: position and quaternion.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
-# Joint values that differ by at most this count as equal [rad|m].
+# Joint values count as equal if they differ by at most this [rad|m].
 _SAME = 1e-9
 
 
@@ -108,15 +108,15 @@ class LinearBatch(validation.Result):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # _x0 is None at rest, because x0 then follows from q. _y0 is None if the outputs are the state.
+    # _x0 is None at rest, because x0 then follows from q. _y0 is None if the output is the state.
     _x0: Array | None
     _y0: Array | None
-    # _reference is None if the reference is the base's own placement, which follows from q and
-    # _root.
+    # _reference is None if the reference of each point is its own base pose. This pose follows from
+    # q and _root.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Further fields of the models: the same at all points, or taken from the robot.
+    # Further fields of the models, which are the same at all points or computed from the robot.
     _asked: Mapping[str, object]
     verified: bool = True
 
@@ -292,7 +292,7 @@ class LinearBatch(validation.Result):
         return LinearBatch(**found, _asked=ready.common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
-        """Return all arrays with one row per point, by name."""
+        """Return {name: array} of all arrays; each array has one row per point."""
         held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
         return {key: value for key, value in held.items() if value is not None}
 
@@ -306,7 +306,7 @@ class LinearBatch(validation.Result):
     def _model(self, index: int) -> LinearModel:
         common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
-        # The row is read from the file here, so that no model keeps the file open.
+        # The row is copied from a file into memory, so that the model does not keep the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
@@ -327,7 +327,7 @@ class LinearBatch(validation.Result):
         return frozen(x0)
 
     def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Column, Any]]:
-        """Return for each named joint: its name in messages, its column and its given value."""
+        """Return (name in messages, column, given value) of each joint in `joints`."""
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
@@ -335,8 +335,8 @@ class LinearBatch(validation.Result):
         return [(f"joint '{name}'", columns[name], value) for name, value in joints.items()]
 
 
-# Names of a batch's fields by kind, in order. The fields in TEXTS are the same at all points and
-# are stored in the header of a file. Arrays have one row per point.
+# Names of a batch's fields, grouped by type. Arrays have one row per point. The fields in TEXTS are
+# the same at all points; a file stores them in its header.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]

@@ -1,7 +1,7 @@
-"""Run a job on rows, chunk by chunk, into a store that may already contain chunks.
+"""Run a job on chunks of rows, and save the results in a store that may contain finished chunks.
 
 Chunks run on threads of this process, on worker processes that the call starts, or on the workers
-of a given executor. The job defines the meaning of the rows and the results.
+of a given executor. The job defines what the rows and the results are.
 """
 
 from __future__ import annotations
@@ -30,37 +30,40 @@ from fflin.kernel.compiled import available_cores
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Chunks submitted per worker at a time, so that a worker never waits for its next chunk.
+# Largest number of submitted chunks per worker. With two, a worker never waits for its next chunk.
 _QUEUED = 2
 
-# Number of workers assumed if an executor does not report it.
+# Assumed number of workers of an executor that does not report the number.
 _UNKNOWN_WORKERS = 16
 
 Progress: TypeAlias = Callable[[int, int], object]
 
-# Named arrays of equal length, and a function that returns the rows from start to stop - 1.
+# Rows: {name: array}, arrays of equal length. RowsOf: function of `start` and `stop` that returns
+# rows start to stop - 1.
 Rows: TypeAlias = Mapping[str, Array]
 RowsOf: TypeAlias = Callable[[int, int], Rows]
 
-# First and last row + 1 of a chunk, and the arrays of its result with its warnings.
+# Span: index of a chunk's first row, and of its last row plus one. Result: {name: array} for a
+# chunk, and the warnings of its computation.
 Span: TypeAlias = tuple[int, int]
 Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
 
 
 class Job(Protocol):
-    """Computation on rows; it is pickled, and each worker unpickles it once."""
+    """Computation on rows. Jobs are sent to workers pickled; a worker unpickles each job once."""
 
     shapes: dict[str, tuple[int, ...]]  # shape per row of each array of the result
     threaded: bool  # whether threads of this process can compute chunks in parallel
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array], /) -> list[str]:
-        """Write the results of the rows from `start` on into `out`, and return warnings."""
+        """Write the results of a chunk, whose first row is `start`, into `out`; return warnings."""
 
 
 class Execution(ExitStack):
-    """Where the chunks of a call run; a context that ends the worker processes of the call.
+    """Threads or executor that compute the chunks of a call.
 
-    The arguments are those of `sweep`; each must be valid, or `InputError` is raised.
+    The object is a context manager; on exit, it ends the worker processes that it started. The
+    arguments are described in `sweep`. `InputError` is raised for an invalid argument.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class Execution(ExitStack):
             self.executor = self.enter_context(OwnWorkers(workers))
 
     def count(self, job: Job) -> int:
-        """Return the number of chunks of a job that are computed at the same time."""
+        """Return how many chunks of a job are computed in parallel."""
         if self.executor is None:
             return self._threads if job.threaded else 1
         for name in ("_max_workers", "num_workers"):
@@ -112,9 +115,12 @@ def run_chunks(
 ) -> None:
     """Compute the missing chunks of a store, and save the results.
 
-    The store saves the rows and results for which it has arrays. Only chunks that begin before
-    `upto` are computed. If chunks fail, the others are computed, and `SweepError` is raised with
-    ``made(arrays of the other rows)``. Without `made`, the first failure raises `FflinError`.
+    The store saves the rows and results for which it has arrays. Only chunks that begin before row
+    `upto` are computed.
+
+    If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If their
+    results are in memory, `made` creates the attribute `batch` of this error from them. Without
+    `made`, the first failure stops the call with `FflinError`.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):
@@ -172,7 +178,7 @@ def _results(
     waiting, running = deque(spans), dict[futures.Future[Result | str], Span]()
     try:
         while waiting or running:
-            # Results wait in memory until they are consumed, so their number is limited.
+            # Finished chunks stay in memory until they are saved, so few chunks are submitted.
             while waiting and len(running) < _QUEUED * count:
                 span = waiting.popleft()
                 try:
@@ -207,7 +213,7 @@ def _reason(error: Exception) -> str:
 
 
 def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
-    """Run a pickled job on one chunk; called in a worker."""
+    """Run a pickled job on one chunk, and return its result; a worker calls this function."""
     job = _unpickled(pickled)
     out = {key: np.empty((stop - start, *shape)) for key, shape in job.shapes.items()}
     return out, job.run(rows, start, out)
@@ -215,7 +221,7 @@ def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
 
 @lru_cache(maxsize=4)
 def _unpickled(job: bytes) -> Job:
-    """Return an unpickled job, cached in each worker so that the job is prepared once."""
+    """Return an unpickled job; a worker caches the job, so that it is prepared only once."""
     result: Job = pickle.loads(job)
     return result
 
@@ -226,7 +232,7 @@ def _failure(
     of_what: str,
     made: Callable[[dict[str, Array]], object],
 ) -> SweepError:
-    """Return the error that lists the failed chunks; see `run_chunks`."""
+    """Return a `SweepError` that lists the failed chunks; see `run_chunks`."""
     kept = np.ones(store.count, dtype=bool)
     for start, stop, _ in failed:
         kept[start:stop] = False
@@ -254,9 +260,9 @@ def _failure(
 
 
 class OwnWorkers(futures.ThreadPoolExecutor):
-    """Executor with worker processes; if one dies, its task fails and another one starts.
+    """Executor with worker processes; if a process dies, its task fails and a new process starts.
 
-    Each thread has a pool of one process, so that the others continue if a process dies.
+    Each thread has its own pool of one process, so that a dying process stops no other process.
     """
 
     def __init__(self, count: int) -> None:
@@ -270,14 +276,14 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         self._ended = ""  # reason why no further process can start
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
-        """Call a function in a worker process; raise `FflinError` if the process dies."""
+        """Call a function in a worker process; its future raises `FflinError` if that dies."""
         return super().submit(self._do, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        # Do not join the threads; they end with their processes. If Ctrl-C interrupts a wait
-        # for a future, the future remains locked. A thread that must set the result of this future
-        # would never end.
+        # Do not join the threads, because a join could block forever: if Ctrl-C interrupts a wait
+        # for a future, the future stays locked. The thread that must set its result then never
+        # ends. All other threads end with their processes.
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
             self._ended = "the workers have been shut down"
@@ -303,8 +309,8 @@ class OwnWorkers(futures.ThreadPoolExecutor):
                 if self._ended:
                     raise FflinError(self._ended)
                 with _starting():
-                    # With fork, a process would inherit locks that other threads hold, and could
-                    # wait for them forever.
+                    # A forked process would inherit locks that other threads hold, and could wait
+                    # for these locks forever.
                     pool = futures.ProcessPoolExecutor(1, get_context("spawn"), _prepare)
                     ready = pool.submit(int)
                 self._pools.append(pool)
@@ -329,9 +335,9 @@ _TURN = Lock()
 def _starting() -> Iterator[None]:
     """Start processes that import nothing from the working folder and ignore Ctrl-C.
 
-    By default, a process that multiprocessing starts imports from the working folder first, until
-    it has copied `sys.path` from its parent process. Ctrl-C also reaches the parent process, which
-    ends the others.
+    By default, a process that multiprocessing starts imports modules from the working folder first,
+    until it has copied `sys.path` from its parent process. Ctrl-C also reaches the parent process,
+    which then ends its worker processes.
     """
     from multiprocessing import resource_tracker, util
 
@@ -341,8 +347,7 @@ def _starting() -> Iterator[None]:
         names[key] = lambda: ["-I", *usual()]
         masked = getattr(signal, "pthread_sigmask", None)  # not on Windows
         if masked:
-            # Start the resource tracker first. If it were started together with a process, it would
-            # unblock the signal.
+            # Start the resource tracker first, because its start unblocks SIGINT.
             resource_tracker.ensure_running()
             before = masked(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -354,7 +359,7 @@ def _starting() -> Iterator[None]:
 
 
 def _prepare() -> None:
-    """Let a worker process leave Ctrl-C to its parent process, and end with it."""
+    """Make a worker process ignore Ctrl-C, and end when its parent process ends."""
     caller = parent_process()
     assert caller is not None
 

@@ -44,15 +44,16 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
-# Size of a chunk's result: large enough that computing it takes much longer than sending it, and
-# small enough that several of them fit in memory.
+# Limits of the size of a chunk's result [bytes] and of its number of rows. A chunk must take much
+# longer to compute than to send, and several chunks must fit into memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
 # Warning filters belong to the whole process, so only one thread at a time changes them.
 _TURN = Lock()
 
-# Attributes that identify a robot, in addition to its model and its mappings.
+# Attributes that identify a robot, in addition to its Pinocchio model and the springs of its
+# joints.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity", "orbit"),
@@ -166,7 +167,7 @@ def sweep(
     task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
-        # All threads or workers compute equally many chunks.
+        # The chunk size is chosen such that every thread or worker computes equally many chunks.
         same = how.count(job)
         size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
         size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
@@ -189,9 +190,10 @@ def sweep(
 
 
 class ChunkJob:
-    """Job that linearises chunks of points with `Linearizer`; `at_rest` means zero velocity.
+    """Job that linearises chunks of points with `Linearizer`.
 
-    The rows of a chunk are q, and v and u0 unless they are zero.
+    The rows of a chunk contain q; they also contain v or u0 if velocities or inputs are given. If
+    neither is given, the caller sets `at_rest`.
     """
 
     def __init__(
@@ -213,19 +215,19 @@ class ChunkJob:
             raise InputError(
                 f"engine='compiled' is not possible, because {reason}; leave engine out"
             )
-        # Compiled accelerations for many points at once; None if Python computes the points.
+        # Compiled function for the accelerations at many points; None if Python computes them.
         self._kernel: RowAccelerations | None = None
         if engine != "python" and not reason:
             self._kernel = prepared.kernel()
         self.threaded = self._kernel is not None
         self._data = robot.create_data()
         self._inertia = Inertia(prepared.map, self._data)
-        # If a free robot is at rest about its own reference, A and f0 are constant, so only B is
-        # computed.
+        # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
+        # each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
         nx, nu = prepared.map.nx, len(prepared.actuation.names)
         ny = len(prepared.common["output_names"])
-        # Shape per point of each array that varies between points.
+        # Shapes, per point, of the arrays that differ between points.
         self.shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
         if not self.only_inertia:
             self.shapes |= {"A": (nx, nx), "f0": (nx,), "_x0": (nx,)}
@@ -236,7 +238,7 @@ class ChunkJob:
         self.row_bytes = 8 * (robot.nq + sum(map(math.prod, self.shapes.values())))
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Only the arguments are pickled, because each worker needs its own work space.
+        # Only the arguments are pickled, because each worker allocates its own work arrays.
         return self._again, ()
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
@@ -252,7 +254,7 @@ class ChunkJob:
         return [str(note.message) for note in caught]
 
     def _write_one(self, rows: Rows, row: int, out: Mapping[str, Array]) -> None:
-        """Write a row in Python."""
+        """Linearise about one point in Python, and write the row of this point."""
         q, nv = rows["q"][row], self.shapes["B_lower"][0]
         if not self.only_inertia:
             point = {key: each[row] for key, each in rows.items()}
@@ -265,12 +267,12 @@ class ChunkJob:
         inverse = B_lower if actuation.default else np.empty((nv, nv))
         inertia.invert(q, inverse)
         if not actuation.default:
-            # The columns do not depend on the base position, so the base is moved to the origin to
-            # avoid rounding errors.
+            # The input matrix does not depend on the base position. So the base is moved to the
+            # origin, which avoids rounding errors.
             np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write rows in compiled code; return the rows for which it is not accurate or possible."""
+        """Write rows in compiled code, and return the indices of rows that Python must compute."""
         kernel, q = self._kernel, rows["q"]
         count = len(q)
         if kernel is None:
@@ -293,7 +295,7 @@ class ChunkJob:
     def _write_anywhere(
         self, kernel: RowAccelerations, rows: Rows, out: Mapping[str, Array]
     ) -> Mask:
-        """Write A, B, f0 and x0 about any points, and return which rows are valid."""
+        """Write the models about points of any kind, and return the mask of valid rows."""
         ready, q, A, B = self.linearizer.prepared, rows["q"], out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
         own = ready.own_reference
@@ -315,7 +317,7 @@ class ChunkJob:
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
         # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
-        # checked, because it is finite if q0 and f0 are valid.
+        # checked, because it is finite if f0 and the quaternion's scalar part q0 are valid.
         good = good & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(values, values) < LARGEST
@@ -334,11 +336,11 @@ class SweepTask:
     ) -> None:
         self.job, self.robot = job, (robot := job.linearizer.robot)
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
-        # Points that are generated on demand, and rows that are known before the sweep; a velocity
-        # or input of all points is one row.
+        # `_points` generates configurations on demand. `_known` contains the given arrays; a single
+        # velocity or input for all points is broadcast to rows.
         self._points, self._known = None, dict[str, Array]()
         if isinstance(q, Grid | RandomConfigurations):
-            # The robot may have other inputs or outputs, but its joints must be the same.
+            # The robot of the points can have other inputs or outputs, but must have equal joints.
             if q.robot.joints != robot.joints:
                 raise InputError(
                     f"q was made for '{q.robot.name}', whose joints differ from the joints of "
@@ -356,7 +358,8 @@ class SweepTask:
             nu = len(prepared.actuation.names)
             of_inputs = partial(vector, "u", size=nu, of_what="the robot's inputs")
             self._known["u0"] = checked_rows("u", u, nu, of_inputs, count)
-        # The known arrays that vary between points, and the shapes per point of all that do.
+        # `given`: the known arrays that vary between points. `shapes`: the shapes, per point, of
+        # all arrays that vary between points.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
         self.shapes = {**job.shapes, "q": (robot.nq,)}
         self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
@@ -369,11 +372,11 @@ class SweepTask:
         }
         if not prepared.own_reference:
             constants["_reference"] = prepared.reference
-        # One row of each array that is the same at all points.
+        # Value of each array that is the same at all points.
         self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
-        """Return points start to stop - 1."""
+        """Return the configurations, velocities and inputs of points start to stop - 1."""
         drawn = {"q": self._points.rows(start, stop)} if self._points else {}
         return {**drawn, **{key: rows[start:stop] for key, rows in self._known.items()}}
 
@@ -401,7 +404,7 @@ class SweepTask:
 
     @property
     def request(self) -> str:
-        """Digest of everything on which the result depends."""
+        """Digest of the robot, the options and the points, on which the result depends."""
         robot, prepared = self.robot, self.job.linearizer.prepared
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
         placements = [placement.homogeneous for placement in robot.model.jointPlacements]

@@ -1,5 +1,6 @@
-"""Monte Carlo campaigns: many runs of a closed loop with random robot, start and sensor errors.
+"""Monte Carlo campaigns: many runs of a closed loop with random errors.
 
-The package contains the dispersions, the runs and their statistics, and the campaign with its
-report. Runs are computed eight at a time in compiled code, or one by one in Python.
+The errors are in the robot, the initial state and the sensors. The modules draw the errors, compute
+the runs, and report the statistics of all runs. Runs are computed eight at a time in compiled code,
+or one by one in Python.
 """

@@ -1,4 +1,4 @@
-"""Campaign: the outcomes of its runs, and statistics with confidence intervals."""
+"""Campaign: outcomes of Monte Carlo runs, and statistics with confidence intervals."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Bound(NamedTuple):
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
     """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
 
-    `figure` returns the values (N,) and the unit of a quantity.
+    The function `figure` returns the values (N,) of a named quantity, and its unit.
     """
     bounds = []
     for part in condition.split(" and "):
@@ -367,7 +367,7 @@ class Campaign(FrozenArrays):
         write_atomically({target: content.getvalue()})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write the campaign and further strings, such as the request that identifies the call."""
+        """Write the campaign, and strings such as the digest that identifies the call."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})

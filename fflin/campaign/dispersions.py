@@ -1,4 +1,4 @@
-"""Dispersions: random values by name, and the robots and initial states that follow from them."""
+"""Dispersions: named random values, which determine the robot and initial state of each run."""
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +34,7 @@ from fflin.simulation.plan import Times
 from fflin.simulation.run import Plant
 
 _BLOCK = 1024  # runs drawn together, independent of the chunks
-# Axes of the kinds of dispersions that have a value for each axis.
+# Names of the axes, for the kinds of dispersions that have one value per axis.
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
@@ -43,7 +43,7 @@ _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
-    """Random value of each run, and the quantities that this value changes."""
+    """Random variable with one value per run, and the quantities that this value changes."""
 
     name: str
     kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
@@ -53,7 +53,7 @@ class Column(NamedTuple):
 
 
 class Dispersions:
-    """Dispersions of `monte_carlo`: random values, and the runs' robots and initial states."""
+    """Dispersions of `monte_carlo`, which draw the robot and initial state of each run."""
 
     def __init__(
         self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
@@ -70,7 +70,7 @@ class Dispersions:
         elif isinstance(reads, TrajectoryOutputFeedback):
             sensors = reads.filter.output_names
         modes = tuple(each.name for each in robot.modes)
-        # Names of the quantities of each kind.
+        # {kind of dispersion: names of the quantities that can be dispersed}.
         self._known: dict[str, tuple[str, ...]] = {
             **dict.fromkeys(_OF_SENSORS, sensors),
             **dict.fromkeys(_OF_BODIES, tuple(robot.pieces)),
@@ -80,7 +80,7 @@ class Dispersions:
         }
         kinds = [*self._known]
         self._known |= {"state": plant.state.names, "delay": ("delay",), "seed": (SEED,)}
-        # Indices of the joints of the modes, in the order of the names.
+        # Joint index of each mode, in the order of `modes`.
         self._modes = [robot.joint_names.index(name) for name in modes]
         by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
@@ -108,9 +108,9 @@ class Dispersions:
             self._add(kind, spreads, " | ".join(kinds))
         # Names of the dispersed values.
         self.names = tuple(column.name for column in self.columns)
-        # Drawn values of slow distributions, by name and block.
+        # Cached values of slow distributions: {(name, block of runs): values}.
         self._kept: dict[tuple[str, int], Array] = {}
-        # The mass of a link must not be dispersed twice, directly or as part of a body.
+        # A mass must not be dispersed twice: once for a link, and again for the link's body.
         pieces = [*robot.pieces.values()]
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
@@ -123,7 +123,11 @@ class Dispersions:
                 )
 
     def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
-        """Add the columns of a kind from {name: (inverse distribution function, tie or "")}."""
+        """Add the columns of one kind of dispersion.
+
+        `spreads` maps a name or pattern to an inverse distribution function, and to the common name
+        of tied values; the common name is "" for independent values.
+        """
         robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
             raise InputError(
@@ -170,7 +174,10 @@ class Dispersions:
     def _by_piece(
         self, kind: str, spreads: Mapping[str, tuple[Inverse, str]]
     ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
-        """Return {link or body: spread}, and {link or body: key} for keys without a wildcard."""
+        """Return {link or body: spread}, and {link or body: key} for keys without a wildcard.
+
+        A key without a wildcard overrides patterns that match the same link or body.
+        """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         for key in sorted(spreads, key=alone.__contains__):  # names override patterns
@@ -189,9 +196,9 @@ class Dispersions:
         return found, named
 
     def drawn(self, start: int, stop: int) -> Array:
-        """Return the values (N, k) of runs start to stop - 1.
+        """Return the drawn values (N, k) of runs start to stop - 1.
 
-        They depend only on seed, name and run.
+        A value depends only on the seed, the name of the value and the number of the run.
         """
         drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
@@ -202,13 +209,13 @@ class Dispersions:
         return drawn
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:
-        """Return the first `count` values of a block of runs.
+        """Return a column's values in a block of runs, at least the first `count` of them.
 
-        Values of slow distributions are kept for later calls.
+        Values of slow distributions are cached for later calls.
         """
         key = (self._seed, zlib.crc32(column.name.encode()))
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-        # The inverse may be infinite at 0 and 1, so the values are kept between them.
+        # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
         if isinstance(column.inverse, partial):  # a closed form of `spreads`
             return column.inverse(uniform)
@@ -242,7 +249,7 @@ class Dispersions:
             said = f"an invalid initial attitude is drawn in the runs from {start} on"
             try:
                 self.starts(drawn)
-                # A drawn inertia may be too small for the flexible modes of its body.
+                # A drawn inertia can be too small for the flexible modes of its body.
                 if appendages := self._plant.robot.appendages:
                     refused = first_impossible(self._model, appendages, self.bodies(drawn))
                     if refused is not None:
@@ -252,7 +259,7 @@ class Dispersions:
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
-        """Return the drawn values (N, size) or (N, size, axes) of a kind, `rest` if not drawn."""
+        """Return the values of a kind, (N, size) or (N, size, axes); `rest` if not dispersed."""
         axes = len(_AXES.get(kind, " "))
         found = np.full((len(drawn), len(self._known[kind]), axes), rest)
         for values, column in zip(drawn.T, self.columns, strict=True):
@@ -279,9 +286,9 @@ class Dispersions:
         return {joint: properties(before[joint] + sum(x)) for joint, x in changed.items()}
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
-        """Return the stiffness and the damping (N, n) of all joints, each if it is dispersed."""
+        """Return {part: values (N, n) of all joints} for dispersed stiffness and damping."""
         found = dict[str, Array]()
-        # If the frequency of a mode changes, its damping ratio stays the same.
+        # A change of a mode's frequency does not change its damping ratio.
         frequency = 1.0 + self._of("frequency", drawn)
         for kind, power in zip(_OF_SPRINGS, (2, 1), strict=True):
             if self._kinds & {kind, "frequency"}:
@@ -291,7 +298,7 @@ class Dispersions:
         return found
 
     def _faults(self, drawn: Array) -> ActuatorFaults | None:
-        """Return the faults of the inputs in each run (N,), or None if no fault is dispersed."""
+        """Return the actuator faults of N runs, or None if no fault is dispersed."""
         if not self._kinds & {*_OF_INPUTS, "misalignment"}:
             return None
         gain, bias = self._of("gain", drawn), self._of("bias", drawn)
@@ -307,7 +314,7 @@ class Dispersions:
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
     def in_lanes(self, drawn: Array) -> dict[str, Array]:
-        """Return the arrays of the compiled loop that vary between runs."""
+        """Return the arrays of the compiled loop that differ between runs, one row per run."""
         plant, (q, v), count = self._plant, self.starts(drawn), len(drawn)
         tree = batch_tree(plant.robot)
         assert tree is not None
@@ -317,12 +324,12 @@ class Dispersions:
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (count, 1, 1))
             for at, body in self.bodies(drawn).items():
-                # In the tree, wheels are numbered together with the joints.
+                # The tree also numbers the wheels, so a body has another index than in `_model`.
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # Only the change of the body is added, because its parameters also contain its
-                # wheels.
+                # The changed body does not include its wheels, but the parameters in the tree do.
+                # So only the change of the body is added to them.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
@@ -344,7 +351,7 @@ class Dispersions:
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
-        """Return a run's robot with its inputs, its policy, and its initial q and v."""
+        """Return the plant and the policy of one run, and its initial q and v."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
@@ -374,14 +381,14 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Function that creates a policy for a robot, and the linear model of its design, if any."""
+    """Policy that is bound to a robot by the function `bind`; `lin` is the model of its design."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None
 
 
 def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
-    """Return a policy whose states or outputs (ny,) have these measurement errors."""
+    """Return a policy that reads its states or outputs (ny,) with a bias and random noise."""
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
     generator, given = noise_generator(seed[0]), getattr(policy, "noise", None)
@@ -404,10 +411,10 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return the inertial parameters (N, 10) of bodies along `axes`, the columns of a matrix.
+    """Return the inertial parameters (N, 10) of bodies in the axes that are columns of `axes`.
 
-    The parameters are the mass m, the products m c with the centre of mass c, and the inertia about
-    the origin (xx xy xz yy yz zz).
+    The parameters are the mass m, the vector m c with the centre of mass c, and six entries (xx xy
+    xz yy yz zz) of the inertia about the origin.
     """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
@@ -416,7 +423,7 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
 
 
 def turned(direction: object, angles: Array) -> Array:
-    """Return a direction rotated by angles (N, 2) [rad] about two perpendicular axes, (N, 3)."""
+    """Rotate a direction by angles (N, 2) [rad] about two axes normal to it; return (N, 3)."""
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]
     side = angles[:, 1:] * first - angles[:, :1] * second
@@ -425,7 +432,7 @@ def turned(direction: object, angles: Array) -> Array:
 
 
 def _misaligned(robot: Robot, angles: Array) -> Robot:
-    """Return a robot whose thrusters and wheels are rotated by angles (nu, 2)."""
+    """Return a robot whose thrusters and wheel axes are rotated by angles (nu, 2) [rad]."""
     inputs = list(robot.inputs)
     for place, item, _, at in _mounted(robot):
         inputs[place] = _pointed(item, turned(_direction(item), angles[at : at + 1])[0])
@@ -433,7 +440,10 @@ def _misaligned(robot: Robot, angles: Array) -> Robot:
 
 
 def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
-    """Return wrenches, stored momenta, joint placements and inertia changes of each run (N,)."""
+    """Return the arrays of the compiled loop that change with misalignment angles (N, nu, 2).
+
+    The arrays are wrenches of inputs, stored momenta, joint placements and changes of inertias.
+    """
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
     stored = np.tile(tree.stored, (count, 1)).reshape(count, -1, 3)
@@ -468,7 +478,7 @@ def _direction(item: Thruster | ReactionWheel) -> Array:
 
 
 def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | ReactionWheel:
-    """Return a thruster or wheel with another direction."""
+    """Return a copy of a thruster or wheel that points along another direction."""
     if isinstance(item, Thruster):
         return replace(item, direction=along.tolist())
     return replace(item, axis=along.tolist())
@@ -477,7 +487,7 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
 def _mounted(
     robot: Robot,
 ) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int]]:
-    """Yield each thruster and wheel: its index in `inputs`, itself, its names, its index in u."""
+    """Yield (index in `robot.inputs`, item, names, index in u) of each thruster and wheel."""
     first = 0
     for place, (item, names) in enumerate(named_inputs(robot.inputs)):
         if isinstance(item, Thruster | ReactionWheel):

@@ -32,20 +32,20 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# _PILOTS is the number of runs per trial level in the search for the largest level. _HALVINGS is
-# the largest number of halvings.
+# The search for the largest level simulates _PILOTS runs at each trial level, and halves the level
+# at most _HALVINGS times.
 _PILOTS, _HALVINGS = 16, 40
-# Largest errors of a start: attitude [deg], revolute joint [rad], and position or prismatic joint
-# [m].
+# Largest initial errors: of the attitude [deg], of a revolute joint [rad], and of the position or a
+# prismatic joint [m].
 _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
-    """Return W (nx, nx) with W W' a generalised inverse of P, for a P with mixed units.
+    """Return W (nx, nx) such that W W' is a generalised inverse of P.
 
-    P is scaled to a unit diagonal, and W contains the symmetric root of its pseudoinverse.
-    Eigenvectors are not unique, so errors drawn along them would depend on the processor's
-    rounding.
+    P is first scaled to a unit diagonal, because its states have different units. W then contains
+    the symmetric square root of the pseudoinverse of P, because this root is unique. Eigenvectors
+    are not unique, so errors drawn along them would depend on rounding.
     """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -386,9 +386,10 @@ def funnel(
 def _outcomes(
     final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the codes of `Funnel.outcomes` for bounds on final errors and on errors at any time.
+    """Return the codes of the outcomes of runs; see `Funnel.outcomes`.
 
-    P (nx, nx) is the matrix of the final level.
+    `final` contains bounds of the final errors, and `within` contains bounds of the errors at all
+    times. P (nx, nx) is the matrix of the final level.
     """
     e = runs["state_errors"][:, -1]
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
@@ -403,14 +404,15 @@ def _outcomes(
 def _tested(
     job: CampaignJob, P: Array, samples: int, rng: np.random.Generator, how: Execution
 ) -> tuple[float, Array]:
-    """Return the largest level tested at a knot, and the outcomes (samples,) up to this level.
+    """Return the largest level tested at a knot, and the outcomes (samples,) up to that level.
 
-    About one run in 16 fails at the largest level. P (nx, nx) is the matrix of the level.
+    The largest level is chosen such that about one run in 16 fails at this level. P (nx, nx) is the
+    matrix of the level.
     """
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
     def simulate(roots: Array) -> Array:
-        """Return the outcomes of runs from random errors e (N, nx) with sqrt(e' P e) = roots."""
+        """Simulate runs from random errors e with sqrt(e' P e) = `roots`; return the outcomes."""
         e = rng.normal(size=(len(roots), len(P))) @ W.T
         # Directions in which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
@@ -423,9 +425,10 @@ def _tested(
         np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
         *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
     ]
-    # `root` is the square root of a level; at `widest`, a start has one of the largest errors.
+    # `root` is the square root of a level. At `widest`, an error on the ellipsoid reaches one of
+    # the largest initial errors.
     root = widest = float(1.0 / max(reach))
-    # If the goal is missed even without an error, the widest level is tested.
+    # If the run without an initial error already misses the goal, the widest level is tested.
     if not simulate(np.zeros(1)).any():
         for _ in range(_HALVINGS):
             if not simulate(np.full(_PILOTS, root)).any():
@@ -445,21 +448,21 @@ def runs_from(
     options: Mapping[str, object],
     judge: Judge | None = None,
 ) -> CampaignJob:
-    """Return the runs from knot k of the trajectory, which is knot `first` of the schedule."""
+    """Return a job for runs that start at knot k of the trajectory (`first` of the schedule)."""
     motion, schedule = feedback.trajectory, feedback.schedule
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
     policy = replace(
         feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
     )
-    # The chart is centred at the knot, because its attitude may be any rotation. Histories have
-    # entries at the start and at the end.
+    # The attitude at the knot can be any rotation, so the chart is centred at this attitude.
+    # Histories have two entries, at the start and at the end.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
 def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
-    """Return {kind: largest error} from a given mapping, or raise `InputError`."""
+    """Return the checked bounds {kind: largest error}, or raise `InputError`."""
     given = {kind_named(str(key)): x for key, x in validation.by_name(name, given, "kind").items()}
     require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
@@ -477,7 +480,7 @@ def _shown(bounds: Mapping[str, float]) -> str:
 def _indices(
     motion: Trajectory, by: GainSchedule, knots: int | Sequence[float]
 ) -> list[tuple[int, int]]:
-    """Return the indices of the chosen knots in the trajectory and in the schedule."""
+    """Return (index in the trajectory, index in the schedule) of each chosen knot."""
     t, own = motion.t - motion.t[0], by.t - by.t[0]
     at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)
     both = np.flatnonzero(np.abs(own[at] - t) <= 1e-6 * (by.dt or t[-1]))

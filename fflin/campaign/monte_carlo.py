@@ -27,9 +27,9 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
-# With `until`, the interval is first computed after _STAGE runs, and again when the number of runs
-# has grown by the factor _GROWTH. _STAGE is a multiple of the chunk size, so that chunks do not
-# affect the number of runs.
+# With `until`, the confidence interval is first computed after _STAGE runs, and again each time the
+# number of runs has grown by the factor _GROWTH. _STAGE is a multiple of the chunk size, so that
+# the chunk size does not affect the number of runs.
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
@@ -268,7 +268,7 @@ def _require_sendable(job: CampaignJob) -> None:
 
 
 def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
-    """Return the goals; raise an error for a goal that an empty campaign cannot evaluate."""
+    """Return the goals; each is evaluated on the empty campaign `none` to find invalid goals."""
     listed = [given] if isinstance(given, str) else given
     goals: list[str] = [
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
@@ -293,7 +293,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 
 def _header(job: CampaignJob) -> dict[str, object]:
-    """Return the header of a campaign: everything that is not an array."""
+    """Return the header of a campaign: all fields that are not arrays."""
     plan, plant, robot = job.plan, job.plant, job.plant.robot
     others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
@@ -318,7 +318,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
 
 
 def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
-    """Return a digest of everything on which the result depends."""
+    """Return a digest of the call and its drawn values, on which the result depends."""
     drawn = job.dispersions.drawn(0, min(runs, _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))

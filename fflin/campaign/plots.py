@@ -15,7 +15,8 @@ from fflin.campaign.report import ended_of, goal_met
 from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import TRUSTED, Validity, shown
 
-# For each band: fraction of runs outside it on each side, name and opacity; widest band first.
+# Bands, widest first: (fraction of runs above the band, name, opacity). The same fraction of runs
+# is below the band.
 _BANDS = (
     (0.0, "all runs", 0.13),
     (0.05, "90 % of runs", 0.22),
@@ -116,8 +117,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     percent = 100.0
     with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
-        # The figure shows the error relative to the displacement. Its order is therefore one less
-        # than the order of the absolute error.
+        # The figure shows the error relative to the displacement. The order of this relative error
+        # is one less than the order of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
@@ -206,9 +207,9 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands over time of values (N, M) of the runs `of`, and a line for each of `runs`."""
-    # Interpolation between infinite values is not finite, so each bound of a band is the value of
-    # one run.
+    """Draw bands of values (N, M) over time for the runs `of`, and a line for each of `runs`."""
+    # Infinite values of stopped runs are drawn at the upper edge. To avoid interpolation with this
+    # edge, each bound of a band is the value of one run.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -234,7 +235,7 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
 
 
 def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
-    """Draw the bounds that the goals set on these quantities."""
+    """Draw the bounds in the goals for the named quantities."""
     for bound in campaign.bounds:
         if bound.name in names:
             draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
@@ -265,7 +266,7 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
 def _inputs(
     axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
 ) -> None:
-    """Draw the largest input of a group over time in the completed runs, and its limit."""
+    """Draw the largest input of a group in the completed runs over time, and the input limit."""
     largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
     if not campaign.stopped.all():
         _bands(axes, campaign, largest, runs, ~campaign.stopped)
@@ -278,7 +279,7 @@ def _inputs(
 
 
 def _correlations(axes: Axes, campaign: Campaign) -> None:
-    """Draw rank correlations with the default quantity, and the range that chance can explain."""
+    """Draw the rank correlations with `Campaign.about`, and the range that is not significant."""
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)

@@ -17,7 +17,7 @@ _SHARES = (0.5, 0.95, 0.99)
 
 
 def campaign_report(campaign: Campaign) -> str:
-    """Return the report: success rates of goals, error quantiles and rank correlations."""
+    """Return the report with success rates of goals, error quantiles and rank correlations."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
@@ -56,8 +56,8 @@ def goal_met(campaign: Campaign, goal: str) -> str:
 def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
     """Return the significant rank correlations of the drawn values with each quantity of interest.
 
-    At most five quantities are included: first the quantities in the goals, then the worst errors,
-    then the settling time.
+    At most five quantities are included, in this order: `Campaign.about`, the quantities in the
+    goals, the worst errors and the settling time.
     """
     doubt = 3.0 / math.sqrt(len(campaign))
     about = [campaign.about, *(x.name for x in campaign.bounds)]
@@ -95,7 +95,10 @@ def _when(time: float, unit: str = "") -> str:
 
 
 def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
-    """Return the report as JSON values: estimates are [value, low, high], infinity is null."""
+    """Return the report as JSON values, with estimates as [value, low, high].
+
+    Infinity is written as null.
+    """
 
     def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]

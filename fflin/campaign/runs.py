@@ -1,8 +1,8 @@
-"""Runs of a campaign: their computation in chunks, and their statistics.
+"""Computation of the runs of a campaign in chunks, and statistics of each run.
 
 Runs are computed eight at a time in compiled code, or one by one in Python. The statistics of a run
-are its final and largest errors, its settling times, and histories at a few times. Their size does
-not depend on the duration of the run.
+are its final errors, its largest errors, its settling times, and histories at a few times. The size
+of the statistics does not depend on the duration of the run.
 """
 
 import math
@@ -39,8 +39,8 @@ from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
 from fflin.simulation.run import Recording, go, stop_conditions, stop_of
 from fflin.simulation.simulate import motion_of
 
-# Kinds of errors with their units. The error of a kind is its largest entry; wheels and modes do
-# not count as joints.
+# Kinds of errors with their units. The attitude error is the rotation angle. Any other error is the
+# largest magnitude of the states of its kind; wheels and modes do not count as joints.
 KINDS = {
     "attitude": "deg",
     "position": "m",
@@ -49,7 +49,8 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
-# Attitude error [deg] at which a run is close to the end of the chart.
+# If the attitude error exceeds this [deg], a run counts as having left the chart, which ends at
+# 180 deg.
 EDGE = 176.0
 # LOOK is the number of steps between checks of a stop condition. _LONG is the number of steps per
 # call without a stop condition.
@@ -58,7 +59,8 @@ LOOK, _LONG = 64, 2**20
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
 
-# Function of the state errors (N, nx) at the start and now; returns the mask (N,) of ended runs.
+# Function that returns the mask (N,) of runs to end; its arguments are the state errors (N, nx) at
+# the start and the present state errors (N, nx).
 Over: TypeAlias = Callable[[Array, Array], Mask]
 
 # Former names of kinds, which conditions and goals still accept.
@@ -73,10 +75,11 @@ def kind_named(name: str) -> str:
 
 
 class Judge(NamedTuple):
-    """Evaluation of runs, whose results replace the record of a campaign; it is sent to workers."""
+    """Evaluation of runs. A job returns its results in place of the arrays of a `Campaign`."""
 
     fields: tuple[str, ...]  # names of the results
-    # Return the results (N,) from the runs' outcomes; the first history entry is the start.
+    # Function that returns {name: result (N,)} from the outcomes of N runs. The first entry of a
+    # history is the start of the run.
     figures: Callable[[Mapping[str, Array]], dict[str, Array]]
     over: Over | None = None  # condition that ends a run early
 
@@ -100,10 +103,10 @@ def kinds_of(state: StateMap) -> Indices:
 
 
 class CampaignJob:
-    """Runs of one plan, each with its own drawn values; see `batch.run.Job`.
+    """Job for runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    Without dispersions, the drawn values are the deviations of the initial state. A `judge` may end
-    runs early, and its results replace the record of a campaign.
+    Without dispersions, the drawn values are the deviations of the initial state. A `judge` can end
+    runs early; the job then returns the results of the judge, not the arrays of a `Campaign`.
     """
 
     def __init__(
@@ -118,7 +121,7 @@ class CampaignJob:
     ) -> None:
         self._again = partial(CampaignJob, robot, policy, given, seed, options=options, judge=judge)
         settings: dict[str, Any] = dict(options)
-        # A judge compares errors with the errors at the start, so the histories contain the start.
+        # A judge compares errors with the initial errors, so the histories contain the start.
         histories = settings.pop("histories", 0 if judge is None else 1)
         unlimited = settings.pop("unlimited", False)
         settings |= {"robot": robot, "policy": policy, "linear": False, "progress": False}
@@ -131,8 +134,8 @@ class CampaignJob:
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
-        # Errors are deviations from a fixed state (nx,) or a moving state (steps + 1, nx), whose q
-        # and nu are the arrays of `path`.
+        # Errors are deviations from `target`: a fixed state (nx,) or the states (steps + 1, nx) of
+        # a reference motion. `path` contains q and nu of this motion.
         self.target, self.path = self.x0 if self.plan.target is None else self.plan.target, []
         if reference := self.plan.reference:
             t = times.dt * np.arange(times.steps + 1)
@@ -146,8 +149,8 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # Shapes per run: of each array of `Campaign`, with the state errors, which are NaN after a
-        # run was stopped; and of each array of the result. They follow from a run without steps.
+        # `outcome_shapes` has the shape, per run, of each array of an outcome; it is read from the
+        # outcome of a run without steps. `shapes` has the shapes of the arrays of the job's result.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
         self.outcome_shapes = {key: x.shape for key, x in self.outcome(none).items()}
@@ -168,9 +171,9 @@ class CampaignJob:
     def digest(self, first: Array) -> str:
         """Return a digest of the robot, the policy, the options and the first run (1, k).
 
-        For the compiled engine, the arrays that its loop reads contain all of these, so nothing is
-        compiled. For the Python engine, a policy may be any function, whose content cannot be
-        hashed. Then the digest contains the outcome of the first run instead.
+        With the compiled engine, it is the digest of the arrays that the loop reads; it needs no
+        compilation. With the Python engine, the policy can be any function, whose content cannot be
+        hashed. The digest is then computed from the outcome of the first run.
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
@@ -213,7 +216,7 @@ class CampaignJob:
         return []
 
     def errors(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the states (N, nx) of q and v at the first N steps, and their errors."""
+        """Return the states (N, nx) for q and v at the first N steps, and the state errors."""
         state, target = self.plant.state, self.target
         moving = target.ndim == 2
         x = states_of(state, q, state.velocities(v))
@@ -225,7 +228,8 @@ class CampaignJob:
     def outcome(self, run: Recording) -> dict[str, Array]:
         """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
 
-        The outcome also has the state errors at the times of the histories.
+        The outcome also contains the state errors at the times of the histories; they are NaN after
+        the run was stopped.
         """
         count, steps, dt = len(run.q), self.steps, self.plan.times.dt
         kind, target = kinds_of(self.plant.state), self.target
@@ -260,7 +264,7 @@ class CampaignJob:
         )
 
     def plan_of(self, drawn: Array) -> Plan:
-        """Return the plan of a run (k,)."""
+        """Return the plan of the run with the drawn values (k,)."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
         times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
@@ -268,7 +272,7 @@ class CampaignJob:
 
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows
     def _one(self, drawn: Array) -> dict[str, Array]:
-        """Return the outcome of a run (k,) in Python."""
+        """Simulate the run with the drawn values (k,) in Python, and return its outcome."""
         plan = self.plan_of(drawn)
         if over := self.judge and self.judge.over:
             first = self.errors(plan.q[None], plan.v[None])[1]
@@ -281,21 +285,21 @@ class CampaignJob:
         return self.outcome(_recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
-        """Estimate the time [s] of runs on one core from a few steps of the first runs."""
+        """Estimate the time [s] of `count` runs on one core, from a few steps of the first runs."""
         few, plan, drawn, times = copy(self), self.plan, first[: self.lanes], list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
         short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
         for each in (1, short, long):  # the first run compiles the loop if needed
             few.plan = plan.replace(times=plan.times._replace(steps=each))
-            # Other programs may slow down one of the trials.
+            # Other programs can slow down a trial, so the fastest of three trials counts.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
             times.append(min(repeat(timed, timer=perf_counter, repeat=3, number=1)))
         step = (times[2] - times[1]) / (long - short) if long > short else 0.0
         return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
-        """Repeat a run (k,) with the same arithmetic, and return its motion."""
+        """Repeat the run with the drawn values (k,), by the same engine, and return its motion."""
         plan = self.plan_of(drawn)
         if self.engine == "python":
             run = _recorded(plan, plan.times.every)
@@ -357,21 +361,21 @@ class RunStatistics(lanes.Statistics):
             values[:] = initial
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
+        """Return the mask (LANES,) of runs that the judge ends at q and v (LANES, ..)."""
         if self._over is None:
             return np.zeros(LANES, dtype=bool)
         first = _by_run(self._marks.states[: self._state.nx])
         return self._over(first, self._job.errors(q, v)[1])
 
     def add(self, first: int, rows: Array) -> None:
-        """Add rows (steps, width, LANES) of q, nu, u, .. from step `first` on."""
+        """Add steps from step `first` on; `rows` (steps, width, LANES) has q, nu, u and more."""
         take = kernel("loop", "take", "the run statistics")
         take(self._words, rows.reshape(-1, LANES), first, len(rows))
         sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
         self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of the runs after `done` steps; `stop` has indices into STOPS."""
+        """Return the outcomes of eight runs after `done` steps; `stop` has indices into STOPS."""
         (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
@@ -394,7 +398,7 @@ class RunStatistics(lanes.Statistics):
 
 
 def _by_run(values: Array, *shape: int) -> Array:
-    """Convert values (.., LANES) with one lane per run to rows (LANES, *shape)."""
+    """Convert values (.., LANES), with the runs along the last axis, to rows (LANES, *shape)."""
     shape = shape or (len(values),)
     return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
 
@@ -436,7 +440,7 @@ def _remade(again: Callable[..., CampaignJob], engine: str) -> CampaignJob:
 
 
 def chunk_size(count: int, workers: int, least: int = LANES) -> int:
-    """Return the number of runs per chunk that gives each worker several chunks."""
+    """Return a number of runs per chunk such that each worker computes several chunks."""
     size = _LARGEST_CHUNK
     while size > least and 4 * workers * size > count:
         size //= 2

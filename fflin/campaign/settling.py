@@ -1,7 +1,7 @@
-"""Settling of a regulated robot: error norm, random displacements, and runs from them.
+"""Settling of a regulated robot from random displacements, measured with an error norm.
 
-The norm is the square root of a Lyapunov function of the linear loop. The rate of this function is
-minus a quadratic form in units of energy.
+The norm is the square root of a Lyapunov function of the linear loop. Along the linear loop, this
+function decreases at a rate that is a quadratic form in units of energy.
 """
 
 import math
@@ -39,9 +39,10 @@ OUTCOMES = ("slow", "settled", "chart", "diverged")
 
 
 class Loop:
-    """Regulated robot: its model, and the feedback ``u = u0 - K (z - z0)`` of the model's states z.
+    """Regulated robot with a linear model and a feedback of the model's states.
 
-    `InputError` is raised if the loop cannot settle at the operating point.
+    The feedback is ``u = u0 - K (z - z0)`` for the states z of the model. `InputError` is raised if
+    the loop cannot settle at the operating point.
     """
 
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
@@ -53,7 +54,7 @@ class Loop:
         if part.state_names == kept:  # states that are not fed back do not settle
             K, lin = K @ selection(kept, lin.state_names).T, part
         self.robot, self.lin, self.K = robot, lin, K
-        # Map of the full state of the robot, in the axes of the model.
+        # Map between (q, v) and the full state of the robot, in the frame of the model.
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
         if not len(lin.x0):
@@ -63,7 +64,8 @@ class Loop:
                 "the operating point is not an equilibrium at rest, so the loop cannot settle "
                 "there; linearise about an equilibrium"
             )
-        # State (nx,) at the operating point, and indices of the model's states in it.
+        # Full state (nx,) at the operating point, and indices of the model's states in the full
+        # state.
         self.start = state.to_state(lin.q, lin.v)
         self.model_states = np.array([state.names.index(name) for name in lin.state_names])
         # State matrix of the linear loop, and its slowest decay rate [1/s].
@@ -85,8 +87,8 @@ class Loop:
 
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # The size of a coordinate is the size of its rate times the decay rate. Some rates have no
-        # coordinate.
+        # The weight of a coordinate is the weight of its rate times the decay rate of the loop. For
+        # some rates, the model has no coordinate.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
@@ -102,7 +104,11 @@ class Loop:
     def displaced(
         self, rng: np.random.Generator, attitude: float, position: float, joint: float
     ) -> Array:
-        """Return a state (nx,) whose model states have random displacements [deg], [m], [rad|m]."""
+        """Return a state (nx,) in which the states of the model are displaced at random.
+
+        The attitude [deg] and the position [m] are displaced by the given amounts. The largest
+        displacement of a joint [rad|m] is `joint`.
+        """
         g, x = self.state.groups, self.start.copy()
         axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
@@ -126,15 +132,15 @@ def settling_runs(
     engine: str | None = None,
     fine: int = 0,
 ) -> CampaignJob:
-    """Return runs of a loop from displaced states; a run ends if it settles, or at a horizon.
+    """Return a job that simulates the loop from displaced states.
 
-    With `predicts`, runs last three time constants and are compared with the linear loop. `joint`
-    is the largest displacement of a joint. `fine` is the number of times that the steps have been
-    shortened.
+    A run ends when it settles or diverges, or at a horizon. With `predicts`, a run always lasts
+    three time constants and is compared with the linear loop. `joint` is the largest displacement
+    of a joint. `fine` is the number of times that the steps have been shortened.
     """
     lin, decay = loop.lin, loop.decay
-    # The open loop also limits the step, because inputs are constant between samples and at
-    # saturation.
+    # The step is also limited by the poles of the open loop, because the loop is open between
+    # samples and at saturation.
     free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
     rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
     fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
@@ -154,7 +160,7 @@ def settling_runs(
     dt, every = dt / finer, every * finer
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
     options |= {"limits": limits, "project": not predicts}
-    # Without limits, inputs do not saturate and thrusts may be negative.
+    # Without `limits`, inputs do not saturate, and thrusts can be negative.
     options |= {"unlimited": limits is None}
     options |= {"histories": checks + 1} if predicts else {}
     step = _transition(loop, dt, every) if predicts else None
@@ -166,8 +172,9 @@ def settling_runs(
 def _transition(loop: Loop, dt: float, every: int) -> Array:
     """Return the transition matrix of the linear loop from one check to the next.
 
-    For a linear system, CF4 is the classical fourth-order method: each step multiplies the state by
-    the stability polynomial. The two loops therefore differ only by nonlinear terms.
+    For a linear system, the integrator CF4 equals the classical Runge-Kutta method. Each step then
+    multiplies the state by a fourth-order Taylor polynomial of the matrix exponential. The linear
+    loop uses the same polynomial, so the simulated loop differs only by nonlinear terms.
     """
     if loop.lin.dt:
         return loop.rate
@@ -177,14 +184,17 @@ def _transition(loop: Loop, dt: float, every: int) -> Array:
 
 
 def _is_over(loop: Loop, first: Array, e: Array) -> Mask:
-    """Return whether runs have settled or diverged, from their errors (N, nx) at first and now."""
+    """Return the mask (N,) of settled or diverged runs.
+
+    `first` (N, nx) are the initial state errors, and `e` (N, nx) the present state errors.
+    """
     first, size = (loop.size(each[:, loop.model_states]) for each in (first, e))
     over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
     return over
 
 
 def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the outcomes (indices into OUTCOMES) and largest relative prediction errors of runs.
+    """Return the outcome of each run, an index into OUTCOMES, and its relative prediction error.
 
     `step` is the transition matrix of the linear loop from one history entry to the next. If it is
     None, runs are not compared with the linear loop.
@@ -210,8 +220,8 @@ def settle(
 ) -> dict[str, Array]:
     """Return the results of runs; diverging runs are repeated with shorter steps.
 
-    `runs_of(fine=k)` creates the runs after k step reductions. `starts` (N, nx) are the initial
-    deviations.
+    `runs_of(fine=k)` returns the job whose steps have been shortened k times. `starts` (N, nx) are
+    the initial deviations.
     """
     arrays, left = dict[str, Array](), np.arange(len(starts))
     for fine in range(_FINEST + 1):

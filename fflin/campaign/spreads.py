@@ -1,4 +1,4 @@
-"""Spreads of random values, from Python or a TOML file, as inverse distribution functions."""
+"""Spreads of random values, given in Python or a TOML file, and their inverse distributions."""
 
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
@@ -27,13 +27,13 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, object]):
-    """{name, group or pattern: spread} from a file, with the file's line numbers."""
+    """Dispersions {name, group or pattern: spread} from a file, with the lines of the file."""
 
     document: TomlFile
 
 
 def placed(dispersions: object) -> AbstractContextManager[None]:
-    """Add the file and the line of a spread to errors that name the spread."""
+    """Return a context manager that adds the file and line to errors about a spread."""
     if isinstance(dispersions, DispersionFile):
         return dispersions.document.located(_TABLE)
     return nullcontext()
@@ -108,7 +108,7 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
 
 
 def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (name, spread) of a table; its key path ``base.mass = 0.1`` becomes "base.mass"."""
+    """Yield (name, spread) of a table; the key ``mass`` in ``base`` gives the name "base.mass"."""
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
             yield from _names(value, f"{before}{key}.")
@@ -156,9 +156,10 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
 
 
 def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
-    """Return the inverse distribution function of a spread; a number is the value if `fixed`.
+    """Return the inverse distribution function of a spread.
 
-    The functions of this module are partial functions; others may be slow.
+    A number is a standard deviation; if `fixed`, all runs have this number as their value. The
+    functions of this module are `partial` objects. Functions of other objects can be slow.
     """
     if hasattr(spread, "ppf"):
         try:
@@ -208,5 +209,5 @@ def _whole(end: float, u: Array) -> Array:
     return np.floor(end * u)
 
 
-# Seeds of noise: whole numbers below 2^53, which doubles represent exactly.
+# Inverse distribution of the noise seeds: whole numbers below 2^53, which are exact as doubles.
 SEEDS = partial(_whole, 2.0**53)

@@ -27,7 +27,7 @@ _MOST = 1_000_000  # random runs
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
 TRUSTED = 0.1  # largest accepted relative prediction error
 
-# Largest displacement that may be given, in [m] and [rad].
+# Largest accepted value of a displacement argument.
 _FARTHEST = 1e6
 
 
@@ -233,7 +233,7 @@ def validity(
     levels = (np.arange(samples) + 0.5) / samples
 
     def displaced(levels: Array, streams: Indices) -> Array:
-        """Return the initial deviations of runs, each from its own random stream."""
+        """Return the initial deviations of runs; one random stream gives one direction."""
         x = []
         for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
@@ -241,7 +241,7 @@ def validity(
         return np.array(x) - loop.start
 
     streams = np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))
-    # Runs for the prediction error, and random runs.
+    # The first set of runs measures the prediction error; the second set has random displacements.
     sets = [
         (partial(settling_runs, loop, predicts, limits, largest["joint"], engine), starts)
         for predicts, starts in (
@@ -251,7 +251,7 @@ def validity(
     ]
     total, done, found = sum(len(starts) for _, starts in sets), 0, []
     with how:
-        # A random run usually settles after 1 / PATIENCE of its longest duration.
+        # A random run usually settles after 1 / PATIENCE of the largest duration, and then ends.
         counts = len(streams), math.ceil(samples / PATIENCE)
         expect(progress, [(of(), x, n) for (of, x), n in zip(sets, counts, strict=True)], how)
         for runs_of, starts in sets:
@@ -300,8 +300,8 @@ def _crossing(errors: Array) -> float:
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # The error is assumed proportional to the level, below the first level and above the last
-        # level at which no run failed.
+        # Below the first level, and above the last level without a failed run, the error is assumed
+        # to be proportional to the level.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0
@@ -332,12 +332,12 @@ def _checked_displacement(
 
 
 def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
-    """Return a fraction `level` of a displacement."""
+    """Return a displacement multiplied by the factor `level`."""
     return {key: level * value for key, value in largest.items()}
 
 
 def joint_unit(lin: LinearModel) -> str:
-    """Return the unit of the joints: "rad|m" if there are revolute and prismatic joints."""
+    """Return the unit of the joints; it is "rad|m" if the model has joints of both kinds."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
     of = {unit for name, unit in pairs if name.startswith("q_m.")}
     return of.pop() if len(of) == 1 else "rad|m"

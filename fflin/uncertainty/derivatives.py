@@ -31,16 +31,16 @@ from fflin.uncertainty.parameters import Parameter
 
 WEIGH = (CenterOfMass, Momentum)
 
-# Step of a finite difference: the relative change of M by the changed parameter.
+# Relative change of M in one step of the finite differences.
 _STEP = 2e-3
-# If such a step changes A or B by less than this fraction, rounding errors hide the change.
+# If this step changes A or B by less than this fraction, the change is lost in rounding errors.
 _LEAST = 1e-6
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 _E = np.eye(3)
 
-# Valid bodies whose parameters span all ten: a mass at the joint, masses away from it, and
-# inertias.
+# Ten bodies whose dynamic parameters form a basis: a mass at the joint, three masses away from the
+# joint, and six inertias without mass. The inertias need not be physically realisable.
 _BODIES = (
     pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))),
     *(pin.Inertia(1.0, axis, np.zeros((3, 3))) for axis in _E),
@@ -50,15 +50,16 @@ _BODIES = (
     ),
 )
 _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).round()
-# Spatial inertias (10, 6, 6) per unit of each dynamic parameter; linear rows come before angular
-# rows.
+# Spatial inertia (6, 6) per unit of each of the ten dynamic parameters. As in Pinocchio, linear
+# rows come before angular rows.
 UNITS = np.tensordot(_OF_BODIES, [body.matrix() for body in _BODIES], 1)
 
 
 class ModelDerivatives:
-    """Derivatives of the matrices of a model over the parameters of its robot.
+    """Derivatives of the matrices of a model with respect to the parameters of its robot.
 
-    The derivatives over the ten dynamic parameters of each body follow from (12.1) and (12.2).
+    The derivatives with respect to the ten dynamic parameters of each body follow from equations
+    (12.1) and (12.2) of docs/derivation.md.
     """
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
@@ -77,7 +78,8 @@ class ModelDerivatives:
         accelerations = Accelerations(state, actuation, data)
         self._rates = accelerations.rates(lin.q, lin.v, self._nu, self._u, slopes, by_u)
         Inertia(state, data).invert(lin.q, self._inverse)
-        # The accelerations do not depend on position and velocity of the base; see `Accelerations`.
+        # The accelerations do not depend on the position and linear velocity of the base, so both
+        # are set to zero; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
         self._q[:3] = self._v[:3] = 0.0
         self._gradient = GravityGradient.at(state.field, lin.q) if state.field else None
@@ -86,9 +88,10 @@ class ModelDerivatives:
         self._joints = range(ROOT, robot.model.njoints)
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
-        """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
-        # A, B and f0 are affine in the rates. The additional last row has zero rates, so it gives
-        # the constant part, which is subtracted below.
+        """Return dA, dB, dC, dD, df0 and dy0 (P, ..), one row per parameter."""
+        # `assemble` is an affine function of the acceleration derivatives in `rates`. The last row,
+        # which has no parameter, is zero in `rates`. It gives the constant part of A, B and f0,
+        # which is subtracted below.
         state, ready, count, nv = self._state, self._ready, len(parameters) + 1, len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
@@ -114,9 +117,13 @@ class ModelDerivatives:
         return A, B, C, D, f0, y0[..., 0]
 
     def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
-        """Return dC, dD and dy0 side by side (P, ny, ..), for outputs that depend on masses."""
-        # If the rates change linearly with a parameter, the robot's mass times such an output is
-        # quadratic in the parameter. So a difference of three values is exact for any step.
+        """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..).
+
+        Only outputs that depend on masses or accelerations have nonzero rows.
+        """
+        # If the accelerations change linearly with a parameter, the product of such an output and
+        # the robot's mass is quadratic in the parameter. So a difference of three values is exact
+        # for any step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -149,7 +156,7 @@ class ModelDerivatives:
         return found
 
     def difference(self, one: Parameter) -> float:
-        """Compare the derivatives of A and B with fourth-order differences; return the error."""
+        """Return the relative difference of dA and dB from fourth-order finite differences."""
         if not one.bodies:
             raise InputError(
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -175,7 +182,11 @@ class ModelDerivatives:
 
     @cached_property
     def _of_bodies(self) -> AccelerationDerivatives:
-        """Derivatives (bodies, 10, ..) of the rates, in Pinocchio's joint order."""
+        """Derivatives (bodies, 10, ..) of the rates with respect to the dynamic parameters.
+
+        The rates are the accelerations and their derivatives. The bodies are in Pinocchio's joint
+        order.
+        """
         rates = self._rates
         by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
         count = by_u.shape[:2]
@@ -183,7 +194,8 @@ class ModelDerivatives:
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            # F_p and its derivatives over q_m, nu and base rotations, of bodies one at a time.
+            # RNEA of a model with a single body gives the body's F_p and the derivatives of F_p
+            # with respect to q_m, nu and base rotations.
             lone = self.robot.model.copy()
             lone.armature = np.zeros_like(lone.armature)
             for joint in range(lone.njoints):
@@ -221,15 +233,16 @@ class ModelDerivatives:
         return np.array([self._state.columns(J) for J in full])
 
     def _by_inertia(self, given: Array) -> Array:
-        """Return -M^-1 M_p (bodies, 10, 6 + n, k) times a matrix (6 + n, k)."""
+        """Return the products (bodies, 10, 6 + n, k) of -M^-1 M_p and a given matrix (6 + n, k)."""
         J = self._jacobians()
         forces = UNITS @ (J @ given)[:, None]
         return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
-        """Return the forces of RNEA and their derivatives over q_m, nu and base rotations.
+        """Return the forces of RNEA and their derivatives.
 
-        Springs and inputs are left out.
+        The derivatives are with respect to q_m, nu and base rotations. The forces of springs and
+        inputs are not included.
         """
         state, data, q, gradient = self._state, self._data, self._q, self._gradient
         by_turn: Array = np.zeros((len(self._v), 3))
@@ -246,7 +259,10 @@ class ModelDerivatives:
         return state.forces(tau), project(by_q)[:, 6:], project(by_v), state.forces(by_turn)
 
     def _by_acceleration(self, c: Array, pushed: pin.StdVec_Force | None = None) -> Array:
-        """Return the derivatives of RNEA over q_m at rest, with accelerations c or a wrench."""
+        """Return the derivative of RNEA with respect to q_m at zero velocity.
+
+        RNEA is computed for the accelerations `c` and the external wrenches `pushed`.
+        """
         model, at_rest = self.robot.model, np.zeros_like(self._v)
         given = (self._q, at_rest, self._state.spread(c))
         more = () if pushed is None else (pushed,)
@@ -254,7 +270,11 @@ class ModelDerivatives:
         return self._state.project(by_q)[:, 6:]
 
     def _over_force(self, one: Parameter) -> AccelerationDerivatives:
-        """Return the derivatives of the rates over a parameter that changes forces, not bodies."""
+        """Return the derivatives of the rates with respect to a parameter that changes no body.
+
+        The rates are the accelerations and their derivatives. The parameter changes a spring, a
+        damper or the wrench of an input.
+        """
         state, u, size = self._state, self._u, len(self._inverse)
         F: Array = np.zeros(size)
         B = np.zeros_like(self._rates.by_u)
@@ -283,7 +303,7 @@ class ModelDerivatives:
 
 
 def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:
-    """Set the bodies of a model to those of `before`, changed by `size` of a parameter."""
+    """Set the bodies of `model` to the bodies of `before` after a change `size` of a parameter."""
     for joint, change in one.bodies.items():
         changed = before.inertias[joint].toDynamicParameters() + size * change
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(changed)

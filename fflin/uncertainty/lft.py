@@ -3,15 +3,21 @@ r"""Linear-fractional models: A and B as exact functions of uncertain parameters
 :math:`\dot x = A x + B_1 w + B_2 u,\; z = C_1 x + D_{11} w + D_{12} u,\; w = \Delta z` with
 :math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`, each :math:`\delta_k` between -1 and 1.
 
-The force F that accelerates a link with the accelerations a is
+The accelerations a of the robot need the following generalised force F for each link:
 
     s = T X a,   f = D s,   F = X^T T^T f
 
-X is the Jacobian of the link's centre of mass in the axes of its inertia, D = blkdiag(m E, I), and
-T is the shift of an uncertain centre of mass (otherwise the identity E). The numbers of signals
-that parameters multiply are: 3 for a mass, 6 for a density, 1 for a diagonal entry of the inertia,
-2 for an off-diagonal entry, and 2 in T and 2 in T^T for a coordinate of the centre of mass. These
-numbers are minimal: they are the ranks of the changes of M, since X has full rank on a free base.
+X is the Jacobian of the link's centre of mass in the axes of its inertia, and D = blkdiag(m E, I)
+contains the mass m and the inertia I. T shifts an uncertain centre of mass; it is the identity E if
+the centre of mass is known. Each parameter multiplies the following number of signals:
+
+- 3 for a mass,
+- 6 for a density,
+- 1 for a diagonal entry of the inertia, and 2 for an off-diagonal entry,
+- 4 for a coordinate of the centre of mass: 2 in T and 2 in T^T.
+
+These numbers are minimal, because each is the rank of the change of M: X has full rank on a free
+base.
 """
 
 from __future__ import annotations
@@ -197,7 +203,7 @@ class LFT(Design):
 
 
 class Range(NamedTuple):
-    """Range of a parameter: the parameter, its middle value and half width."""
+    """Parameter with the middle value and the half width of its range."""
 
     parameter: Parameter
     middle: float
@@ -205,7 +211,7 @@ class Range(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Block of an uncertain model: one delta, which varies a parameter or several tied ones.
+    """Block of an uncertain model: one delta, which varies a parameter or several tied parameters.
 
     Tied parameters have a common value, or a common factor on their nominal values.
     """
@@ -217,21 +223,22 @@ class Block(NamedTuple):
     ranges: tuple[Range, ...]
 
     def values(self, value: float) -> dict[str, float]:
-        """Return {parameter: value} for a common value or factor of the block."""
+        """Return {parameter: value} for the block's common value or factor, given as `value`."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
-# Largest number of signals that a parameter multiplies (those of a density).
+# Largest number of signals that one parameter multiplies. A density multiplies this number.
 _MOST = 6
 
 
 def linear_fractional(
     lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
 ) -> LFT:
-    """Return the LFT of a model about a point at rest without forces."""
+    """Return the LFT of a model about an operating point at rest, without forces."""
     form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
-    # Parameters of a link or a mode act together: {(link or mode, its joint): {part: index}}.
+    # Parameters of the same link or mode multiply each other's signals, so each link or mode is
+    # added with all its parameters: {(link or mode, joint): {part: index of the parameter}}.
     together: dict[tuple[str, int], dict[str, int]] = {}
     sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
     modes = sprung & {joint.name for joint in ready.robot.modes}
@@ -277,7 +284,8 @@ def linear_fractional(
 class _Form:
     """Linear-fractional form under construction.
 
-    Signals are rows over (a, x, u, w). Each parameter adds rows to z and terms to the force.
+    A signal is a row of coefficients of (a, x, u, w). Each parameter adds rows to z, and terms to
+    the force.
     """
 
     def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
@@ -295,11 +303,11 @@ class _Form:
         self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
-        # Every parameter has places for _MOST signals, of which it takes as many as it needs.
+        # z has _MOST rows for every parameter. `used` counts the rows that a parameter needs.
         self.used = np.zeros(len(ranges), dtype=np.intp)
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
-        # Inertial and spring forces minus input forces. The equation of motion sets this sum to
-        # zero.
+        # Inertial forces plus spring and damper forces minus input forces. By the equation of
+        # motion, this sum is zero.
         self.force = np.zeros((nv, self.ends[-1]))
         by_a, by_x, by_u, _ = self.parts(self.force)
         by_a[:], by_u[:] = lin.M, -columns
@@ -307,14 +315,15 @@ class _Form:
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 
     def parts(self, signals: Array) -> list[Array]:
-        """Return the views of signals over a, x, u and w."""
+        """Return views of the signals' coefficients of a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
     def times(self, at: int, signals: Array) -> Array:
-        """Return a parameter's change times signals: (shift + half * delta) * signals.
+        """Multiply signals by the change of a parameter from its nominal value.
 
-        The shift is the difference between the middle of the range and the nominal value. The
-        product delta * half * signals is a new w, and `half` times the signals is added to z.
+        The result is (shift + half * delta) * signals. The shift is the difference between the
+        middle of the range and the nominal value. The product half * signals is added to z, and the
+        product delta * half * signals is a new w.
         """
         (one, middle, half), first = self.ranges[at], _MOST * at + self.used[at]
         rows = slice(first, first + len(signals))
@@ -354,7 +363,7 @@ class _Form:
         self.force += J.T @ (back - D @ now)
 
     def add_alone(self, at: int) -> None:
-        """Add the effect of a parameter of a joint, a thruster or a wheel."""
+        """Add the effect of a parameter of a joint, thruster or wheel, independent of others."""
         one = self.ranges[at].parameter
         if one.joint >= 0:
             rate = self.x[[self.state.groups.qdot_m.start + one.joint]]
@@ -370,13 +379,17 @@ class _Form:
                 for joint, parameters in one.bodies.items()
             )
             values, vectors = np.linalg.eigh(change)
-            # The inertia of a wheel is also subtracted from its carrier, so the rank is 2.
+            # The inertia of a wheel is added to the wheel and subtracted from its carrier, so the
+            # change of M has rank 2.
             most = np.argsort(-np.abs(values))[:2]
             L = vectors[:, most]
             self.force += L @ self.times(at, (values[most, None] * L.T) @ self.a)
 
     def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
-        """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta x')."""
+        """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta dx/dt).
+
+        I is the inertia of the mode. Its frequency omega or damping ratio zeta can be uncertain.
+        """
         joint, springs = self.state.robot.joints[index], self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]
         omega, ratio = joint.oscillation(K, D)

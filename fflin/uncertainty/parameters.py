@@ -1,4 +1,4 @@
-"""Named parameters of a robot, their effect per unit, and robots with changed parameters."""
+"""Named parameters of a robot, their effect on the robot, and robots with changed parameters."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -32,19 +32,20 @@ _TURN = 2.0 * math.pi  # [rad]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter, such as "inertia.xx" of "arm", and its effect on the robot per unit."""
+    """Parameter, such as "inertia.xx" of "arm", and the change of the robot per unit."""
 
     of: str
     part: str
     unit: str
     value: float
-    # {Pinocchio joint: change (10,) of its body}: m, m c, and xx, xy, yy, xz, yz, zz of I about
-    # the joint.
+    # {Pinocchio joint: change (10,) of its body per unit}. The ten dynamic parameters are the mass
+    # m, the vector m c, and the entries xx, xy, yy, xz, yz, zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
     joint: int = -1  # joint whose spring or damper changes, in state order; -1 for none
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, change (6,) of its unit wrench in the joint's frame)
+    # (Pinocchio joint, index of the input, wrench (6,)). The wrench is in the joint's frame; it is
+    # the change, per unit, of the wrench that an input of 1 applies.
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -64,7 +65,10 @@ class Parameters(dict[str, Parameter]):
         super().__init__((each.name, each) for each in found)
 
     def find(self, key: str) -> list[str]:
-        """Return the names that match a name or pattern; links take precedence over bodies."""
+        """Return the names that match a name or pattern.
+
+        A pattern matches a body of several links only if it matches no link.
+        """
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
             body = max(bodies, key=len)
@@ -74,13 +78,16 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return the matches of a name, part or pattern, but no body if its links match."""
+        """Return the names that match an owner, part, name or pattern.
+
+        Parameters of a body of several links are left out if other parameters match.
+        """
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
         return [name for name in found if self[name].of not in self._sums] or found
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} is not physically realisable; an empty string if it is."""
+        """Return why {parameter: value} is not physically realisable, or an empty string."""
         try:
             self._bodies(values)
             if self._robot.wheels or self._robot.modes:  # a link may be too light for them
@@ -90,7 +97,7 @@ class Parameters(dict[str, Parameter]):
         return ""
 
     def robot(self, values: Mapping[str, float]) -> Robot:
-        """Return the robot with {parameter: value}, or raise `InputError` if it is impossible."""
+        """Return the robot with {parameter: value}; raise `InputError` if it is not realisable."""
         nominal, bodies, parts = self._robot, self._bodies(values), self._by_owner(values)
         robot = nominal.with_bodies(bodies) if bodies else nominal
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
@@ -117,14 +124,17 @@ class Parameters(dict[str, Parameter]):
         return robot.replace(**changed) if changed else robot
 
     def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return {owner: {part: value}} from {parameter: value}."""
+        """Convert {parameter: value} to {owner: {part: value}}."""
         found: dict[str, dict[str, float]] = {}
         for name, value in values.items():
             found.setdefault(self[name].of, {})[self[name].part] = value
         return found
 
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
-        """Return {joint without wheels: body with changed links}, or raise `InputError`."""
+        """Return {joint: body} for bodies with changed links, or raise `InputError`.
+
+        The joints and the bodies are numbered as in the Pinocchio model without wheels.
+        """
         model, bare = self._robot.model, self._robot._bare.model
         found: dict[int, Array] = {}
         for name, parts in self._by_owner(values).items():
@@ -137,8 +147,8 @@ class Parameters(dict[str, Parameter]):
                 inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
             mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
             density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
-            # Inertias that are not changed are accepted, for example zero for a point mass. An
-            # impossible inertia may be changed unless the change makes it worse.
+            # An unchanged inertia is always accepted, for example zero for a point mass. If the
+            # nominal inertia is not physically realisable, a change must not make it worse.
             was, least = (
                 float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0])
                 / (np.trace(J) or 1.0)
@@ -159,7 +169,7 @@ class Parameters(dict[str, Parameter]):
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
-    """Return the dynamic parameters (10,) of a mass, a first moment and an inertia."""
+    """Return the dynamic parameters (10,) of a body from its mass, first moment and inertia."""
     return np.array((mass, *first, *inertia[np.triu_indices(3)][[0, 1, 3, 2, 4, 5]]))
 
 
@@ -186,10 +196,10 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
 
 
 def _of_joints(robot: Robot) -> Iterator[Parameter]:
-    r"""Yield stiffness and damping of joints, and frequency and damping ratio of modes.
+    r"""Yield the stiffness and damping of each joint, or the frequency and damping ratio of a mode.
 
-    The frequency and damping ratio of a mode with inertia I are those for a link fixed in space.
-    The stiffness is :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
+    The frequency and damping ratio apply to a mode whose link is fixed in space. A mode with the
+    inertia I has the stiffness :math:`I \omega^2` and the damping :math:`2 \zeta I \omega`.
     """
     for index, joint in enumerate(robot.joints):
         name, inertia = joint.name, joint.inertia
@@ -217,8 +227,8 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
             joint, placement = find_frame(robot.model, item.frame)
             where, along = np.array(item.position), np.array(item.direction)
             for letter, d in zip(AXES, np.eye(3), strict=True):
-                # The direction has unit length, so only the part of d perpendicular to it has an
-                # effect.
+                # The direction is normalised, so only the component of d that is perpendicular to
+                # the direction changes it.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))

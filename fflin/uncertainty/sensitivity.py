@@ -17,7 +17,8 @@ from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
 
-# Poles closer than this, relative to the largest pole, count as equal and have no derivative.
+# Poles count as equal if their distance, relative to the largest pole, is smaller than this. Equal
+# poles have no derivative.
 _EQUAL = 1e-6
 _ROUNDING = 1e-12  # smaller effects, relative to the largest entry, are rounding errors
 
@@ -281,7 +282,7 @@ class Sensitivity:
 
 
 def sensitivity_record(found: Sensitivity) -> Record:
-    """Return the entries of a file for a `Sensitivity`."""
+    """Return the entries that a file stores for a `Sensitivity`."""
     every = found.parameters.values()
     return record_of(found.lin) | {
         "parameters": list(found.names),

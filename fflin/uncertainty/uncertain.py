@@ -17,7 +17,7 @@ from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
 from fflin.uncertainty.parameters import Parameter, Parameters
 from fflin.uncertainty.worst import Worst, searched
 
-# Ranges are refused if there are more rejected draws per valid draw than this.
+# Ranges are refused if the number of rejected draws per valid draw exceeds this.
 _TRIES = 1000
 
 
@@ -327,7 +327,7 @@ def _range(one: Parameter, value: object) -> Range:
 
 
 def _tied(key: str, ranges: list[Range], value: object) -> Block:
-    """Return the block of tied parameters, which have a common delta."""
+    """Return the block of several tied parameters, which one delta varies."""
     units = {each.parameter.unit for each in ranges}
     if isinstance(value, tuple | list):
         if len(units) > 1:
@@ -338,6 +338,7 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(number(key, value))
-    # A relative half width has the sign of the nominal value: delta > 0 increases the magnitude.
+    # A relative half width has the sign of the nominal value, so that delta > 0 increases the
+    # magnitude of the parameter.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))

@@ -1,4 +1,4 @@
-"""Worst-case search over a set of robots, and a guaranteed bound of the stable set."""
+"""Worst-case search over a set of robots, and ranges in which stability is guaranteed."""
 
 from __future__ import annotations
 
@@ -21,30 +21,31 @@ if TYPE_CHECKING:
     from fflin.uncertainty.uncertain import Uncertain
 
 _CORNERS = 256
-# Number of steps of a local search, and step lengths relative to half a range; 1e9 leads to a
-# corner.
+# Largest number of steps of a local search, and trial lengths of a step relative to half a range.
+# The length 1e9 leads to a corner of the set.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
-# Number of candidates in each step for which the exact criterion is computed, number of
-# frequencies for the quick criterion, and step of finite differences.
+# In each step, the exact criterion is computed for _HELD trial points. The quick criterion uses
+# _FREQUENCIES frequencies. Gradients are finite differences with the step _DIFFERENCE.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
-# Function of rows of deltas that returns a criterion; larger values are worse.
+# Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# Largest number of signals for which slycot is used. Its time grows with the fifth power of this
-# number.
+# Largest number of signals for which slycot is used, because the time that slycot takes grows with
+# the fifth power of the number of signals.
 _SIGNALS = 24
-# Number of frequencies in the first grid, number of frequencies checked inside an interval, and
-# largest number of divided intervals or slycot calls.
+# _LOOK is the number of frequencies in the first grid. _INSIDE is the number of frequencies checked
+# in an interval. Each of at most _DIVISIONS steps divides an interval or calls slycot.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
-# An interval is not divided if its bound is at most this factor times the bound at some frequency.
+# The search ends if the largest bound of an interval is at most this factor times the largest bound
+# at a single frequency.
 _NEAR = 1.01
 
 Scaling: TypeAlias = tuple[Array, Array]  # d > 0 and g, (n,) each
 
 
 class Figures(NamedTuple):
-    """One criterion of a loop: at a few frequencies, exact, and as a test against a bound."""
+    """Functions for one criterion: quick estimate, exact value, and test against a bound."""
 
     quick: Figure
     exact: Figure
@@ -125,9 +126,10 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([of.makes(corner) for corner in corners])
-    # Draws come last, so a search with more draws begins like a search with fewer draws.
+    # Draws come last, so that a search with more draws first repeats the search with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
-    # The disk margin uses (S - T)/2 with inputs scaled by sqrt(R_ii), as in control.gain.
+    # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
+    # control.gain.
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
@@ -161,7 +163,7 @@ class Gain(NamedTuple):
 
 
 class Loops:
-    """Closed loops of an LFT with u = -K x, at rows of deltas (N, k)."""
+    """Closed loops of an LFT with u = -K x; each row of deltas (N, k) gives one loop."""
 
     def __init__(self, lft: LFT, K: Array) -> None:
         self.lft, self.K = lft, K
@@ -172,13 +174,13 @@ class Loops:
         return A - B @ self.K, B
 
     def undamped(self, rows: Array) -> Array:
-        """Return the negative of the least damping ratio (N,); it is >= 0 for an unstable loop."""
+        """Return minus the least damping ratio of each loop (N,); >= 0 means an unstable loop."""
         poles = np.linalg.eigvals(self.matrices(rows)[0])
         found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
         return found
 
     def gains(self, of: Gain, rows: Array, frequencies: Array) -> Array:
-        """Return the largest gains (N,) at given frequencies; infinite for unstable loops."""
+        """Return the largest gain (N,) over the given frequencies; infinite for unstable loops."""
         F, B = self.matrices(rows)
         found = np.zeros(len(F))
         for w in frequencies:
@@ -189,7 +191,7 @@ class Loops:
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
     def figures(self, of: Gain) -> Figures:
-        """Return the criterion "largest gain" of a channel."""
+        """Return the functions for the criterion "largest gain" of a channel."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
@@ -217,9 +219,10 @@ class Loops:
 
 
 def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Maximise a criterion from the first sample, and from each sample worse than the result.
+    """Return the largest criterion found by local searches, and its deltas.
 
-    The result is at least as bad as each sample, and more samples never make it less bad.
+    A search starts at the first sample, and at each sample whose criterion exceeds the result so
+    far. So no sample exceeds the result, and further samples cannot decrease the result.
     """
     best, at = _climbed(figures, tried[0], makes)
     ahead = tried[1:]
@@ -231,7 +234,7 @@ def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> 
 
 
 def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
-    """Maximise a criterion locally, by steps along its gradient and along single deltas."""
+    """Maximise a criterion locally; a step follows the gradient, or moves one delta to an end."""
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
     for _ in range(_STEPS):
@@ -252,7 +255,7 @@ def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> 
 
 
 def _safe(loops: Loops) -> float:
-    """Return the factor by which the set may be scaled: the inverse of the largest bound of mu."""
+    """Return the inverse of the largest bound of mu; a set scaled by less is proved stable."""
     lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
@@ -266,12 +269,15 @@ def _safe(loops: Loops) -> float:
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
-# parameters, mu may be discontinuous in the frequency, so bounds on a grid do not hold between its
-# frequencies. Therefore one scaling is used for a whole interval of frequencies.
+# parameters, mu can be a discontinuous function of the frequency, so bounds at the frequencies of a
+# grid do not hold between them. Therefore one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:
-    """Return scalings d > 0 (.., n, 1) that make d Z / d small, from the Perron vectors of |Z|."""
+    """Return scalings d > 0 (.., n, 1) that reduce the norm of d Z / d.
+
+    The scalings are computed from the left and right Perron vectors of |Z|.
+    """
     sizes = np.abs(Z) + 1e-9 * np.abs(Z).max(axis=(-2, -1), keepdims=True) + 1e-300
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
@@ -282,7 +288,10 @@ def perron(Z: Array) -> Array:
 
 
 def bound_of(Z: Array, scaling: Scaling) -> float:
-    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all Z in Z (k, n, n)."""
+    """Return the least upper bound b of mu that a scaling proves for all matrices Z (k, n, n).
+
+    With D = diag(d) and G = diag(g), each matrix satisfies Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2.
+    """
     d, g = scaling
     scaled, turned = d[:, None] * Z / d, (g / d)[:, None] * Z / d
     form = scaled.conj().mT @ scaled + 1j * (turned - turned.conj().mT)
@@ -292,9 +301,10 @@ def bound_of(Z: Array, scaling: Scaling) -> float:
 def largest_bound(
     response: Callable[[Array], Array], end: Array, rates: Array, blocks: Array
 ) -> float:
-    """Return the largest bound of Z = response(w) over all frequencies w.
+    """Return the largest bound of mu for response(w) over all frequencies w.
 
-    `end` is the response at infinity. `rates` are the magnitudes of the loop's poles.
+    `end` is the response at infinity. `rates` are the magnitudes and imaginary parts of the loop's
+    poles.
     """
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
     grid = np.unique(np.concatenate(((0.0,), grid, rates)))
@@ -302,7 +312,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound of an interval, its scaling, and the bound of its middle frequency."""
+        """Return the bound for an interval, its scaling, and the bound at the middle frequency."""
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -331,7 +341,7 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return candidate scalings for Z, including the scaling by AB13MD if blocks are given."""
+    """Return trial scalings for Z; if blocks are given, include the scaling by slycot's AB13MD."""
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
@@ -343,7 +353,8 @@ def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
         return found
     if 0 < len(blocks) and len(Z) <= _SIGNALS:
         try:
-            # A delta on one signal is a real block. AB13MD takes a repeated delta as a full block.
+            # AB13MD has no repeated real blocks. A delta of one signal is a real block; a delta of
+            # several signals is entered as a full complex block.
             _, d, g, *_ = ab13md(Z, blocks, np.where(blocks == 1, 1, 2))
         except SlycotArithmeticError:
             return found
