@@ -411,7 +411,7 @@ class Scales:
         return terms
 
     def _speeds(self, v: Array) -> tuple[Array, float, float]:
-        """Return speeds (6 + n,) without the wheels', the largest rate, and the wheels' momentum."""
+        """Return speeds (6 + n,), 0 for wheels; the largest rate; and the wheels' momentum."""
         speed, robot = np.abs(self._state.velocities(v)), self._state.robot
         momentum = 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -423,7 +423,7 @@ class Scales:
         return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
     def rate_errors(self, f0: Array) -> dict[str, float]:
-        """Compare the model with another f0; errors are relative to its largest, perhaps cancelling, terms."""
+        """Compare the model with another f0, relative to the largest terms that f0 sums."""
         mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
         push = _largest(self._lin.u0 * self._input_mobility)
         push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)

@@ -460,7 +460,7 @@ def relative_equilibria(
 
 
 def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of the attitude motion, and the smallest stability criterion / rounding."""
+    """Return the poles (6,) of the attitude motion, and its stability margin in rounding errors."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal
     k_a, k_r = (normal - radial) / along, (normal - along) / radial

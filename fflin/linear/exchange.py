@@ -313,7 +313,7 @@ def _step(tool: str, dt: float | None) -> float:
 
 
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a semi-implicit Euler step (15.6); linear rows come before angular rows."""
+    """Return A, B and f0 of a semi-implicit Euler step (15.6); linear rows precede angular rows."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)

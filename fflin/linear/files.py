@@ -151,7 +151,7 @@ def given(value: T, _: object) -> T:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that saving NAME.csv would overwrite, unless a saved model wrote it; or None."""
+    """Return a file that saving NAME.csv would overwrite and that contains no model, or None."""
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")

@@ -73,7 +73,7 @@ class Prepared:
                 "moving=True measures the error in the axes of the moving base, so no reference "
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
-        # In orbit, the reference is never the base placement, but the orbital frame.
+        # In orbit, the default reference is the orbital frame, not the base placement.
         self.own_reference = reference is None and robot.orbit is None
         require_inertia(robot)
         self.actuation = Actuation(state)
