@@ -81,7 +81,7 @@ class Nonlinear:
         return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
 
     def flow_error(self) -> float:
-        """Compare f with finite differences of states along short motions; return the relative error."""
+        """Return the relative error of f, compared with finite differences along short motions."""
         lin, robot = self._lin, self.state.robot
         state = self.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
         near = Nonlinear(self._aba, lin, state)

@@ -169,22 +169,22 @@ class ToolCoordinates:
         return quaternion, turning.rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
-        """Return the matrix (6, 6) that rotates a twist or wrench from base axes to the tool's axes."""
+        """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes."""
         rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
             rotation[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Differentiate base-axes components of two vectors over a base rotation (4.4): (6, 3).
+        """Differentiate two vectors in base axes over a base rotation (4.4); return (6, 3).
 
-        The derivative is nonzero only for vectors that the tool expresses, and keeps constant, in
-        world axes.
+        A vector that the tool expresses in world axes is constant there, so its components in base
+        axes depend on the rotation. Other vectors have the derivative zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
-        """Return the derivatives at a point; nu (6 + n,), u (nu,) and rates (6 + n,) in base axes."""
+        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) are in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
         # Take a complex step along the motion. If the reference moves with the robot, attitude

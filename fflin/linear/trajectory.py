@@ -155,7 +155,7 @@ class Trajectory(Design):
         )
 
     def _report(self) -> str:
-        """Describe the trajectory, with its residual or the reason why the robot cannot follow it."""
+        """Describe the trajectory, with its residual or the reason why it is not a motion."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         return folded([repr(self), said, *self._note.splitlines()])
 
@@ -212,7 +212,7 @@ class Trajectory(Design):
         return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
-        """Interpolate the inputs, in the axes of `frame`, at a fraction (0 to 1) of the intervals k."""
+        """Return the inputs, in the axes of `frame`, at a fraction (0 to 1) of the intervals k."""
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
 
@@ -456,7 +456,7 @@ def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
 
 
 def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return coefficients (N - 1, 4, ..) of the cubics over [0, 1] with given end values and rates."""
+    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from end values and rates."""
     apart = last - first
     return np.stack(
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
@@ -464,7 +464,7 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
 
 
 def along(motion: Motion, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory; choose constant or linear inputs by the smaller residual."""
+    """Convert a motion to a trajectory, with constant or linear inputs: the smaller residual."""
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"
