@@ -184,7 +184,7 @@ class ToolCoordinates:
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
-        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) are in base axes."""
+        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
         # Take a complex step along the motion. If the reference moves with the robot, attitude

@@ -118,7 +118,7 @@ class Statistics:
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes after `done` steps; `stop` contains, for each lane, an index into STOPS."""
+        """Return the outcomes after `done` steps; `stop` contains an index in STOPS for each lane."""
         return {}
 
 
@@ -154,7 +154,7 @@ class LaneLoop:
             **robot.faults._asdict(),
         }
 
-    # A diverging motion may overflow before it is stopped; NumPy must not warn of this.
+    # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
         """Simulate up to eight runs, by default the plan's own run; return why each was stopped.
@@ -267,7 +267,7 @@ class LaneRows(Statistics):
 
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
-    """Simulate a plan with the compiled loop; `runs` may contain the values of one dispersed run."""
+    """Simulate a plan with the compiled loop; `runs` are the values of one dispersed run."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, runs)
     rows = LaneRows(plan.times, loop.width)
     try:
@@ -289,7 +289,7 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
-    `stop` has rates in the order of v. The law has room for noise if it is `noisy`.
+    The squared rates in `stop` are in the order of v. If `noisy`, the law gets memory for noise.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state
@@ -457,7 +457,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
 def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
-    """Return a trajectory and its gains; if the run lasts longer, append the controller at its end."""
+    """Return a trajectory and its gains; for a longer run, append the gain for its end point."""
     motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]

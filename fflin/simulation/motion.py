@@ -349,7 +349,7 @@ def require_motion(motion: object) -> Motion:
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Convert rows of another robot to this robot's coordinates; its other joints stay at `last`."""
+    """Convert rows of `other` to the coordinates of `robot`; missing joints stay at `last`."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):

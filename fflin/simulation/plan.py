@@ -99,7 +99,7 @@ class Times(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """Square of the angular velocity whose rotation per step is the largest accurate rotation."""
+        """Square of the largest angular velocity at which a step is accurate."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
     @property
@@ -207,7 +207,7 @@ def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> La
 
 
 def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
-    """Return the target state (nx,) from a state or a model's operating point; None if not given."""
+    """Return the target state (nx,), given as a state, as a model about it, or as None."""
     if target is None:
         return None
     if not isinstance(target, LinearModel):
@@ -359,7 +359,8 @@ def _positive(name: str, value: object) -> float:
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
     """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
 
-    The time is rounded up to tens of seconds.
+    The time is rounded up to tens of seconds and is at least SHORTEST. If the loop does not settle
+    before LONGEST, return SHORTEST.
     """
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)

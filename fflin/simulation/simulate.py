@@ -313,10 +313,10 @@ def predictor(plan: Plan) -> Predictor | None:
     )
 
 
-# A prediction that overflows is omitted; NumPy must not warn of this.
+# A prediction that overflows is omitted, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
-    """Return the states (N, nx) that the linear closed loop predicts; no rows if this is impossible."""
+    """Return the states (N, nx) that the linear closed loop predicts; no rows if it cannot."""
     lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
     if lin is None:  # a model in discrete time without its motion between samples
         return x[:0]
