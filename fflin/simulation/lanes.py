@@ -118,7 +118,7 @@ class Statistics:
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes after `done` steps; `stop` contains an index in STOPS for each lane."""
+        """Return the outcomes after `done` steps; `stop` has an index in STOPS for each lane."""
         return {}
 
 

@@ -254,7 +254,7 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
 
 
 def pushed(of: object) -> bool:
-    """Return whether any input of a motion (or of an object with inputs) exerts a force on the base."""
+    """Return whether a motion or similar object has inputs that exert a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
@@ -345,7 +345,7 @@ def _phases(motion: Motion) -> list[list[str]]:
 
 
 def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
-    """Return one line that says whether the motion settled at its target, or which errors did not."""
+    """Return one line that says whether the motion settled, or which errors did not."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]

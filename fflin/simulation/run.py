@@ -110,7 +110,7 @@ class Plant(Aba):
         return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
-        """Return whether no external force acts; if `driven`, input wrenches also count as external."""
+        """Return whether no external force acts; `driven` includes the wrenches of inputs."""
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
@@ -158,7 +158,7 @@ class Conserved:
         self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the sum (6,) of a wrench in base axes and the weight, about the point in world axes."""
+        """Return the sum (6,) of a wrench in base axes and the weight, converted to world axes."""
         if self._field:
             return push
         base = _placement(q[:7] - self._start)
@@ -333,7 +333,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
-    """Return the stop conditions of a run; the limits (nv,) of squared rates are in the order of v."""
+    """Return the stop conditions of a run; limits (nv,) of squared rates are in v's order."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = plan.times.slow
     # If the policy has a linear model, the run ends when the base leaves the attitude chart.

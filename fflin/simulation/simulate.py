@@ -31,9 +31,9 @@ from fflin.simulation.run import Conserved, Disturbance, Recording, go
 # continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
-# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
-# once.
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. A run
+# then takes about the fraction _FRACTION of the time. Compiling takes about _COMPILING seconds, but
+# only once.
 _FRACTION, _COMPILING = 0.1, 30.0
 
 _log = logging.getLogger("fflin")
