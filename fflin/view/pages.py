@@ -172,7 +172,7 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
 
 
 def moved(poses: Array, point: Array) -> Array:
-    """Return the world positions (N, 3) of a point (3,) that is fixed in a frame with poses (N, 7)."""
+    """Return the world positions (N, 3) of a point (3,) in a frame with poses (N, 7)."""
     found: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
     return found
 
@@ -251,7 +251,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
 
 
 def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
-    """Return the poses of a captured payload, for rows of q (N, nq) of the robot that carries it."""
+    """Return the poses of a captured payload, for rows of q (N, nq) of the combined robot."""
     model, data = robot.model, robot.model.createData()
     names = [f"{caught.prefix}.{name}" for name in list(caught.payload.model.names)[ROOT + 1 :]]
     places = [find_frame(model, caught.prefix), *(find_joint(model, name) for name in names)]

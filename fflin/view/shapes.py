@@ -269,7 +269,8 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 # triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles of a mesh. The grid is made coarser until the mesh has fewer.
+# Largest number of triangles of a mesh. The grid is made coarser until the mesh has at most this
+# number, or the cells become too large.
 _LARGEST = 20_000
 
 
@@ -283,7 +284,7 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length; raise ValueError if it has no triangles."""
+    """Read a mesh file, in its own unit of length; raise ValueError if it cannot be drawn."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -317,7 +318,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices [m], faces and colour of each part of a COLLADA file; [] if it is malformed."""
+    """Return vertices [m], faces and colour of each part of a COLLADA file; [] if malformed."""
     import trimesh
 
     try:

@@ -233,7 +233,7 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
-    """Return the name of the tool frame: by default "tool", or else the end of the longest chain."""
+    """Return the tool frame; the default is "tool", or else the end of the longest chain."""
     if tool is not None:
         find_frame(robot.model, tool)
         return tool
