@@ -416,7 +416,7 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
 
 
 def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
-    """Return the linear model for which a gain was designed.
+    """Return the linear model about the point for which a gain was designed.
 
     If the base is at the reference of the gain, the target pose of the base is the new reference.
     """

@@ -193,8 +193,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Report poles only at an equilibrium: along a motion, they do not determine stability. If `A @
-    # A` is zero, all poles are zero and none is reported.
+    # Report poles only at an equilibrium: along a motion, they do not determine stability. If A A =
+    # 0, all poles are zero and none is reported.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)

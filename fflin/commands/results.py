@@ -63,8 +63,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
     """Write the files of a report, print the report, and return the exit code."""
     command, said = arguments.command.prog.split()[-1], [report.interrupted]
     written: list[Path] = []
-    # Write the files before the report is printed, so that a closed pipe cannot prevent it. If
-    # writing a file fails, the report is still printed.
+    # Write the files before the report is printed, so that a closed pipe cannot prevent writing
+    # them. If writing a file fails, the report is still printed.
     try:
         for path, write in report.files.items():
             if path is None:

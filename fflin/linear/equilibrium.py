@@ -216,8 +216,7 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        # If large terms cancel in a force, their rounding errors remain. These are their bounds (6
-        # + n,).
+        # Bounds (6 + n,) of the rounding errors that remain in the forces if large terms cancel.
         state, springs = linearizer.prepared.map, robot.springs
         absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         speed = np.abs(state.velocities(absolute))

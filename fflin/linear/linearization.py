@@ -1,4 +1,4 @@
-"""Linearisation: Linearisation about any point: computes A, B, C and D."""
+"""Linearisation about any point: computation of A, B, C and D."""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ class Nonlinear:
     def rates(self, point: Array) -> Array:
         """Return dx/dt (N, nx) for rows (x, u) (N, nx + nu)."""
         state, (chart, _, v, a) = self.state, self.accelerations(point)
-        # The error rates are edot = (e0 (w - w*) + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x
-        # r. The velocities of the reference are v* and w*.
+        # Rates of the error relative to a reference with velocities v* and w*: edot = (e0 (w - w*)
+        # + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)

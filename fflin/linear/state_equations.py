@@ -132,7 +132,7 @@ def output_equations(
     x0: Array,
     point: Sequence[Array],
 ) -> dict[str, Array]:
-    """Return C, D and y0 at a `point`: q, v, nu (6 + n,) in base axes and u (nu,) in base axes."""
+    """Return C, D and y0; `point` is q, v and, in base axes, nu (6 + n,) and u (nu,)."""
     state, a = sensing.state, rates.c.copy()
     q, v, nu, u = point
     if sensing.needs_acceleration:

@@ -58,7 +58,7 @@ class Jacobians(NamedTuple):
 
 
 class ToolCoordinates:
-    """Coordinates of a tool (or, without a tool, of `lin`) relative to a `StateMap`'s reference."""
+    """Coordinates of a tool, or of fflin's own models, relative to a `StateMap`'s reference."""
 
     def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
         robot, own = state.robot, not tool

@@ -464,7 +464,10 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
 
 
 def along(motion: Motion, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory, with constant or linear inputs: the smaller residual."""
+    """Convert a motion to a trajectory with constant or linear inputs.
+
+    Of the two, the inputs with the smaller residual are chosen.
+    """
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"
