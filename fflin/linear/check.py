@@ -402,8 +402,8 @@ class Scales:
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
-        # Derivatives of velocity products over a unit velocity, at the present rates. For
-        # rotations, they also contain the present linear velocity of the base.
+        # Derivatives of the velocity-dependent accelerations over the velocities, at the present
+        # rates. For angular velocities, they also contain the present linear velocity of the base.
         turning = rate * np.array([_largest(x) for x in np.split(unit, (3, 6))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning

@@ -205,7 +205,7 @@ def equilibrium(
 
 
 class _Balance:
-    """Minimum-norm inputs that balance the forces at a point, in base axes; residual forces."""
+    """Balance of forces at a point: minimum-norm inputs, in base axes, and residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -281,7 +281,7 @@ TOLERANCE = 1e-9
 
 
 def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Array, Array]:
-    """Return the minimum-norm u with ``C u = d`` and ``u[one_sided] >= 0``, and ``C u - d``."""
+    """Minimise ``|C u - d|`` for ``u[one_sided] >= 0``; return u of least norm and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest

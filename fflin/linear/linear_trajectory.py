@@ -244,8 +244,8 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# Steps are halved until the transition matrix of a sample has the accuracy _ACCURACY, or until
-# there are _MOST_PARTS steps.
+# Steps are halved until the transition matrix of a sample has the accuracy _ACCURACY, or until an
+# interval between knots has _MOST_PARTS parts.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
@@ -293,7 +293,11 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return steps and transition matrix of each sample; `parts` steps lie between two cuts."""
+    """Return the steps and the transition matrix of each sample.
+
+    The cuts of a sample are its start, the knots in it, and its end. Each interval between cuts is
+    divided into `parts` parts.
+    """
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])

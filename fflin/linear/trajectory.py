@@ -41,8 +41,8 @@ _CAUSES = (
     "or springs, damping or gravity that differ from the robot"
 )
 
-# Steps are halved until the end of an interval has this accuracy, relative to the largest rates.
-# There are at most _MOST_STEPS steps.
+# Steps are halved until the state at the end of an interval has the accuracy _ACCURACY, relative to
+# the largest rates, or until there are _MOST_STEPS steps.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
 # Rounding errors: of positions, and of accelerations relative to the terms that they sum.

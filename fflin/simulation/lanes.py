@@ -105,7 +105,7 @@ class Statistics:
     span = 4096  # steps between checks of `over`, and for Ctrl-C
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of the runs to end early, given their q and v (LANES, ..)."""
+        """Return the mask (LANES,) of the runs that must end early, from their q and v."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:

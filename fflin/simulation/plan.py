@@ -116,7 +116,7 @@ class Times(NamedTuple):
 
 
 class Plan:
-    """Checked arguments of `simulate`, and what follows from them; constant during the run."""
+    """Checked arguments of `simulate`, and data derived from them; constant during the run."""
 
     def __init__(self, options: SimulationOptions) -> None:
         robot, policy = options.robot, followed(options.policy, options.robot)
@@ -156,15 +156,16 @@ class Plan:
         self.limits = saturation(
             robot, acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
-        # `initial` are the inputs (nu,) until the first command arrives; without a law, no command
-        # arrives.
+        # `initial` contains the inputs (nu,) until the first command arrives. Without a law, they
+        # act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
-        # Target state (nx,), or None; reference state as a function of time, or None.
+        # `target` is the target state (nx,) or None. `reference` is the followed motion, as a
+        # function of time, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
-        # State (nx,) that is nearest to the first row: it determines the full turns of continuous
-        # joints.
+        # State (nx,) that determines the number of full turns of continuous joints in the first
+        # row.
         self.near = self.target
         if options.x0 is not None:
             self.near = np.asarray(options.x0, dtype=float)

@@ -16,7 +16,7 @@ from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.report import STATES, Curve, curves
 
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
-# Titles of charts by the group and the unit of their curves, in the order of the charts.
+# {(group, unit) of curves: title of their chart}, in the order of the charts.
 _TITLES = {
     ("q_b", "1"): "attitude",
     ("r_b", "m"): "position",
@@ -44,7 +44,7 @@ _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target rests; None if never, or with phases."""
+    """Return the time [s] from which a moving target rests; None if never, or for several phases."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if motion.phases or not len(moved) or moved[-1] + 2 >= len(places):

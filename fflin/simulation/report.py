@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 # An error has settled once it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# An error [SI units] that never exceeds THERE means that the robot is at its target throughout. An
-# error below _NOTHING is shown as a dot. Rounding errors of a robot at rest are smaller than both
+# An error [SI units] that never exceeds THERE means that the robot is at its target throughout. A
+# value below _NOTHING is shown as zero. Rounding errors of a robot at rest are smaller than both
 # values.
 THERE, _NOTHING = 1e-9, 1e-14
 
@@ -134,7 +134,7 @@ class Saturated(NamedTuple):
 
 
 def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
-    """Return the limit violations, in the order of their relative size."""
+    """Return the limit violations, largest relative violation first."""
     worst = []
     for curve in found:
         if curve.group == "momentum" or not curve.levels:
@@ -329,8 +329,8 @@ def _phases(motion: Motion) -> list[list[str]]:
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        # Each line: its label, its row of the motion, and the energy and momentum to be added to
-        # this row, because the impact removed them.
+        # Each line has a label, a row of the motion, and the energy and momentum that are added to
+        # those of the row. Before an impact, these are the amounts that the impact removes.
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)

@@ -120,9 +120,10 @@ class Plant(Aba):
 class Conserved:
     """Prediction of the momentum and the centre of mass from the external impulse.
 
-    The momentum is linear, then angular about a fixed point, in world axes. Both are advanced step
-    by step from the initial state (11.2). In orbit, the first entry of the momentum is the Jacobi
-    integral, and the work of the forces replaces the impulse.
+    The momentum (6,) is the linear momentum, then the angular momentum about a fixed point, in
+    world axes. Momentum and centre of mass are advanced step by step from the initial state (11.2).
+    In orbit, the first entry of the momentum is the Jacobi integral, and the work of the forces
+    replaces the impulse.
     """
 
     momentum: Array  # (6,) after the steps so far
@@ -209,8 +210,8 @@ class Conserved:
     def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
 
-        Return the energy (N,), the momentum about the centre of mass (N, 6), the centre of mass (N,
-        3), the momentum about the fixed point (N, 6), and bounds (2,) of the linear and the angular
+        In this order: energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
+        momentum about the fixed point (N, 6), and bounds (2,) of the linear and of the angular
         momentum (11.5). In orbit, the Jacobi integral, followed by zeros, replaces the momentum
         about the fixed point.
         """

@@ -139,7 +139,7 @@ class Live:
         self._each(_Socket.update)
 
     def __call__(self, t: float, q: Array, *_: object) -> None:
-        """Show a step of a running simulation; wait so long that the playback speed is right."""
+        """Show a step of a running simulation; wait first, to keep the playback speed."""
         now = monotonic()
         if self._began is None or t <= self._began[1]:
             self._began = now, t

@@ -1,4 +1,4 @@
-"""HTML pages: of a motion, with a panel of values and plots, and of natural modes.
+"""HTML page of a motion, with a panel of values and plots; HTML page of natural modes.
 
 The page of natural modes animates one mode of a robot at a time.
 """

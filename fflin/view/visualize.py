@@ -1,4 +1,4 @@
-"""`visualize`: shows robots, motions and modes as an HTML file, pictures, or a live page."""
+"""Function `visualize`, which shows robots, motions and modes as a file or as a live page."""
 
 from __future__ import annotations
 
