@@ -245,7 +245,7 @@ def _rows(test: str, errors: Mapping[str, float], tolerance: float) -> list[Row]
 def _output_errors(
     model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float
 ) -> dict[str, float]:
-    """Compare C, D and y0 with differences of the nonlinear outputs; return their errors."""
+    """Return the errors of C, D and y0, compared with differences of the nonlinear outputs."""
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
         errors = {"y0": lin.y0 - lin.x0, "C": lin.C - np.eye(nx), "D": lin.D}

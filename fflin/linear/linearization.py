@@ -160,9 +160,9 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # The ignorable coordinates depend on the robot, not on the point. The position is ignorable
-    # because uniform gravity is the same everywhere. Without gravity, the attitude is ignorable too
-    # if it is relative to a moving reference (`lin.moving`). In orbit, the dynamics depend on both
+    # The ignorable coordinates are the same at all points. The position is ignorable because
+    # uniform gravity is the same everywhere. Without gravity, the attitude is ignorable too if it
+    # is relative to a moving reference (`lin.moving`). In orbit, the dynamics depend on both
     # position and attitude.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]

@@ -312,7 +312,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 
 
 def _require_room(times: Times, state: StateMap, *, chosen: bool) -> None:
-    """Raise an error for too many rows or steps; warn of a small automatically `chosen` step."""
+    """Raise an error for too many rows or steps; warn if an automatically `chosen` step is small."""
     dt, steps, rows, fastest = times.dt, times.steps, times.rows, times.fastest
     width = state.robot.nq + state.robot.nv + 2 * state.nx
     if rows * width > _MOST_ENTRIES or steps > (_ENDLESS if times.thinned else _MOST_STEPS):
@@ -358,7 +358,7 @@ def _positive(name: str, value: object) -> float:
 
 
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
-    """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
+    """Return the time [s] after which the linear loop's errors stay below 1 % of their maxima.
 
     The time is rounded up to tens of seconds and is at least SHORTEST. If the loop does not settle
     before LONGEST, return SHORTEST.

@@ -44,7 +44,10 @@ _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target rests; None if never, or for several phases."""
+    """Return the time [s] from which a moving target rests.
+
+    Return None if the target never moves, does not come to rest, or if the motion has phases.
+    """
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if motion.phases or not len(moved) or moved[-1] + 2 >= len(places):

@@ -42,7 +42,7 @@ _OF_PHASES = (
 STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 _TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
-# Errors of flexible appendages and liquids, which do not count as settling.
+# {group: titles} of the errors of flexible appendages and liquids, which the verdict ignores.
 _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
 _ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
 _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
@@ -305,7 +305,7 @@ def motion_report(motion: Motion) -> str:
 
 
 def motion_record(motion: Motion) -> dict[str, object]:
-    """Return the numbers of the report by name."""
+    """Return the values of the report as {name: value}, for --json."""
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     return {

@@ -190,7 +190,7 @@ class Drawing:
 
 
 def _link(robot: Robot, shape: Shape) -> list[float]:
-    """Return the mass [kg] of a shape's link, and its pose (7,) in the joint's frame."""
+    """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
     model, pieces = robot.model, robot.pieces
     if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body drawn as a box of its inertia
         mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
@@ -273,7 +273,8 @@ class Recorder:
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
         self.forward = forward
-        # {path: {"set_object": ..., "set_transform": ..., "set_property visible": ...}}
+        # Last command of each kind for each node: {path: {"set_object": command, "set_property
+        # visible": command, ...}}.
         self._nodes: dict[str, dict[str, Lowered]] = {}
         self._animation: Lowered | None = None
 

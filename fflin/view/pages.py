@@ -332,7 +332,7 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
     return {
         "title": title,
         "unit": lines[0].unit,
-        # A name has the same colour in all plots of a family.
+        # All plots of a family show a name in the same colour.
         "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
         "lines": [
             {
