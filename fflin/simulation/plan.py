@@ -312,7 +312,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 
 
 def _require_room(times: Times, state: StateMap, *, chosen: bool) -> None:
-    """Raise an error for too many rows or steps; warn if an automatically `chosen` step is small."""
+    """Raise an error for too many rows or steps; warn if a `chosen` automatic step is small."""
     dt, steps, rows, fastest = times.dt, times.steps, times.rows, times.fastest
     width = state.robot.nq + state.robot.nv + 2 * state.nx
     if rows * width > _MOST_ENTRIES or steps > (_ENDLESS if times.thinned else _MOST_STEPS):
