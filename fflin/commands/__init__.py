@@ -1,4 +1,4 @@
-"""Command line with one module per group of commands: parse, call one function, print or save.
+"""Command line: parse arguments, call one library function, print or save its result.
 
 This package imports every other package of fflin; no other package imports it.
 """

@@ -1,4 +1,4 @@
-"""Commands `montecarlo`, `validity`, `funnel` and `sweep`: many simulations or models."""
+"""Commands that run many simulations or models: montecarlo, validity, funnel and sweep."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def sweep(arguments: Namespace) -> Report:
 def _points(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[Configurations, Array | None, Array | None]:
-    """Return q, v and u of the points of a sweep."""
+    """Return the configurations q of a sweep, and the v and u that all its points share."""
     import numpy as np
     import pinocchio as pin
 
@@ -188,7 +188,7 @@ def _points(
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Show a progress bar; after Ctrl-C, report the progress and the file that can be resumed."""
+    """Show a progress bar; after Ctrl-C, report the progress and how to resume."""
     from fflin.batch.files import part_of
 
     bar = Progress()

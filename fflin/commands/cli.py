@@ -1,4 +1,4 @@
-"""Entry point: parse, run a command, and convert errors to one line and an exit code."""
+"""Entry point: parse the arguments, run the command, and report an error in one line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TASKS = {
     "many models or simulations": ("sweep", "montecarlo"),
 }
 
-# {command: module}; `models` has all other commands.
+# {command: module that defines it}. The module `models` defines all other commands.
 _MODULES = {
     **dict.fromkeys(("montecarlo", "validity", "funnel", "sweep"), "campaigns"),
     **dict.fromkeys(("lqr", "tvlqr", "plan", "simulate", "export", "view"), "control"),
@@ -36,7 +36,7 @@ _MODULES = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 if done, 1 if a check failed, 2 for invalid input."""
+    """Run a command; return 0 if it succeeds, 1 if a check fails, 2 for invalid input."""
     reported: set[str] = set()  # each warning is shown only once
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
@@ -62,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.settle_former_names(arguments)
         inputs, outputs = parser.files_of(arguments)
         with files_of_command(inputs, [path for path, _ in outputs]):
-            # An output file that cannot be written is an error before any computation.
+            # Check the output files first, so that an unwritable file is reported before any
+            # computation.
             for path, kind in outputs:
                 check_output_path(path)  # first, because it reports an output that is also an input
                 check_ending(path, kind.endings)
@@ -80,8 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_error(f"fflin: error: {error}")
         return BAD_INPUT
     except BrokenPipeError:
-        # The reader of the pipe, such as head, has closed it. Redirect the output, because Python
-        # would report the closed pipe again at exit.
+        # A program that reads the output, such as head, has closed the pipe. Redirect the output,
+        # because Python would report the closed pipe again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Commands that design, simulate, show or export, and the loops that other commands simulate."""
+"""Commands for controller design, simulation and C code; builders of closed loops."""
 
 from __future__ import annotations
 
@@ -187,10 +187,10 @@ def robot_of_design(
     allocate: bool | None,
     law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
 ) -> fflin.Robot:
-    """Return the robot of a design; with allocation, base torque and force replace the thrusters.
+    """Return the robot of a design; for allocation, a base torque and force replace thrusters.
 
-    By default, thrusters are allocated if they can push in every direction, unless the controller
-    in a file was designed for other inputs.
+    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base. A
+    given `law` must also command a base torque.
     """
     if allocate is None:
         from fflin.control.authority import thrusters_give_every_wrench
@@ -213,7 +213,7 @@ def robot_of_design(
 def designed(
     arguments: Namespace,
 ) -> tuple[fflin.Robot, fflin.Robot, fflin.LinearModel, fflin.Gain]:
-    """Return the robot, the robot of the design, the regulated model, and the regulator."""
+    """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
     _, lin = linear_model(arguments, design)
@@ -230,7 +230,7 @@ def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
 
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
-    """Return the regulator for the weights in the arguments; warn if its margins are small."""
+    """Return the regulator of a model with the weights of the options; warn of small margins."""
     from fflin.control.gain import fragility, one_sided
     from fflin.control.lqr import require_fixed_point
     from fflin.control.weights import rule_weights
@@ -253,7 +253,7 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
 def schedule_of(
     along: fflin.LinearTrajectory, arguments: Namespace, Qf: str | dict[str, float] = "steady"
 ) -> fflin.GainSchedule:
-    """Return the regulator along a trajectory for the weights in the arguments."""
+    """Return the time-varying regulator along a trajectory with the weights of the options."""
     from fflin.control.default_weights import pace_along
     from fflin.control.tvlqr import steady_end
     from fflin.control.weights import rule_weights
@@ -265,7 +265,7 @@ def schedule_of(
 
 
 def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
-    """Raise an error before the simulation if `pictures` would refuse the options."""
+    """Raise an error for invalid options of `pictures`, before a long simulation starts."""
     from fflin.simulation.plan import LONGEST
     from fflin.view.visualize import check_outputs, check_rates, check_times, tool_frame
 
@@ -281,7 +281,7 @@ def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
 def pictures(
     robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
 ) -> dict[Path | None, Callable[[Path], object]]:
-    """Return {path: function that writes the file} for the files that display a motion."""
+    """Return {path: function that writes it} for the requested page and pictures of a motion."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
 
     def show(path: Path) -> None:
@@ -291,7 +291,7 @@ def pictures(
 
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
-    """Return the policy that the arguments define, and the options of `fflin.simulate`."""
+    """Return the policy that the arguments define, and keyword arguments of `simulate`."""
     from fflin.simulation.plan import SHORTEST, time_to_settle
 
     settings: dict[str, Any] = {
@@ -343,9 +343,10 @@ def start_of(
 def about_point(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
-    """Return the policy about a point, its linear feedback, and the model that predicts the motion.
+    """Return the policy about a point, its linear feedback, and the model for the prediction.
 
-    The model is None if the prediction would not contain every row of the motion.
+    The model is None for MPC, a reduced model, a controller from a file, or allocated thrusters.
+    `simulate` then predicts with the policy's own model, or not at all.
     """
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
@@ -388,7 +389,8 @@ def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
 
     if (sample := arguments.sample) is None:
         raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    # These are weights of the integral, but the rule depends on the sample time.
+    # Q and R weight a cost integral, because `lin` is in continuous time. Their default values
+    # depend on the sample time.
     given = weights_of(arguments)
     Q, R, *_ = rule_weights(lin, arguments.weights, given, pace=Pace(hold=sample))
     limits = limits_of_options(arguments)
@@ -414,9 +416,9 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
 
 
 def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
-    """Return the linear model about the operating point of a gain.
+    """Return the linear model about the point for which a gain was designed.
 
-    If the operating point is at its own reference, the target pose of the base is the reference.
+    If the base is at the reference of the gain, the target pose of the base is the new reference.
     """
     import pinocchio as pin
 
@@ -437,5 +439,5 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
 def target_of(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q (nq,), v (nv,) and the reference of the target, by default the operating point."""
+    """Return q (nq,), v (nv,) and reference of the target; the default is the operating point."""
     return point_of(robot, arguments, robot.point, robot.target, prefix="target_")

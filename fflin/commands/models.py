@@ -1,4 +1,4 @@
-"""Commands for one robot or one linear model: from `robots` and `linearize` to `uncertain`."""
+"""Commands for one robot or one linear model, such as robots, linearize and uncertain."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fflin.commands.points import (
 )
 from fflin.commands.results import Report
 
-# Rates [SI] below this value count as zero.
+# Entries of f0 [SI] below this value count as zero.
 _MOVES = 1e-9
 
 _SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
@@ -193,8 +193,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Poles are reported only at a fixed point, because the poles of a model in motion do not show
-    # stability. If A A = 0, all poles are zero.
+    # Report poles only at an equilibrium: along a motion, they do not determine stability. If A A =
+    # 0, all poles are zero and none is reported.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
@@ -227,7 +227,7 @@ def model_report(lin: fflin.LinearModel) -> str:
 
 
 def _units(lin: fflin.LinearModel) -> str:
-    """Return the units of the states, inputs and outputs, once for each group of names."""
+    """Return the units of states, inputs and outputs as text, one unit per group of names."""
     signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units

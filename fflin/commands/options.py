@@ -1,4 +1,4 @@
-"""Options of the commands: groups of options with their help, and special forms of values."""
+"""Options of each command: their groups, their help texts, and forms that differ from `FORMS`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fflin.commands.parser import (
 if TYPE_CHECKING:
     from fflin.commands.results import Report
 
-# Titles of groups of options in the help. The options of ROBOT override settings of robot.toml.
+# Titles of the groups of options in the help.
 POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
@@ -205,7 +205,7 @@ _PICTURES = {
     "speed": "playback speed, in seconds of motion per second; 1 by default",
 }
 
-# {command: {title: {option: help}}}; the name of an argument is in capitals.
+# {command: {title of the group: {option: help}}}; a positional argument is in capitals.
 OPTIONS: dict[str, dict[str, dict[str, str]]] = {
     "robots": {},
     "info": {"": _NAME, POINT: _POSE, ROBOT: _SYSTEM},
@@ -448,7 +448,8 @@ OPTIONS: dict[str, dict[str, dict[str, str]]] = {
     },
 }
 
-# {command: options that the short help lists}; all options if a command is not listed here.
+# {command: options that its short help lists}. For a command without an entry, the short help lists
+# all options.
 COMMON = {
     "linearize": "joint rpy position velocity effort equilibrium frame reference inputs dt for "
     "trajectory output-file plot",
@@ -522,10 +523,10 @@ SPECIAL: dict[str, dict[str, Form]] = {
 def add_command(
     commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], Report]
 ) -> None:
-    """Add the command that a function with the same name runs, with its options.
+    """Add the command with the name of the function `run`, which executes it, and its options.
 
-    The docstring of the function is the help of the command: a summary, and an example at the end.
-    ``--help`` lists the options in `COMMON` and --json, or all options.
+    The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
+    the options in `COMMON`; ``--help all`` lists all options.
     """
     name, (summary, _, example) = run.__name__, (run.__doc__ or "").partition("\n\n")
     command = commands.add_parser(

@@ -1,4 +1,4 @@
-"""Parser of the command line, forms of all options, and functions that read their values."""
+"""Parser of a command, forms of its options, and functions that read their values."""
 
 from __future__ import annotations
 
@@ -57,9 +57,10 @@ def input_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class OutputFile:
-    """Reader for the path of an output file, with the allowed endings.
+    """Reader for the path of an output file, which must have one of the `endings`.
 
-    If `kinds` of results are given, only files that contain one of them are replaced.
+    If `kinds` is not empty, an existing file is replaced only if it contains one of these kinds of
+    results.
     """
 
     endings: tuple[str, ...]
@@ -83,14 +84,14 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE, or for all joints VALUE or urdf alone, with None as the name."""
+    """Read NAME=VALUE for one joint, or VALUE or urdf for all joints, which have the name None."""
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE, or NAME with the value None, which means the neutral position."""
+    """Read NAME=VALUE, or NAME alone; the value None then stands for the neutral position."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -101,7 +102,7 @@ def orbit(text: str) -> dict[str, float | str]:
 
 
 def parameter_range(text: str) -> tuple[str, object]:
-    """Read NAME=FRACTION or NAME=LEAST:LARGEST, with or without ,tied."""
+    """Read NAME=FRACTION or NAME=LEAST:LARGEST, either of which may end with ",tied"."""
     name, _, value = text.rpartition("=")
     tied = value.endswith(",tied")
     ends = value.removesuffix(",tied").split(":")
@@ -129,7 +130,7 @@ def joint_range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values; `form` has the same number of values."""
+    """Split JOINT=A:B:... into the name and its values; their number must be as in `form`."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) != len(form.split(":")):
@@ -146,7 +147,7 @@ def one(
     default: float | str | None = None,
     **more: object,
 ) -> Form:
-    """Return the form of an option with one value, or with one value for each of several names."""
+    """Return the form of an option with one value, or one value for each name in `metavar`."""
     size = {"nargs": len(metavar)} if isinstance(metavar, tuple) else {}
     return {"type": reader, "metavar": metavar, "default": default, **size, **more}
 
@@ -164,7 +165,7 @@ _ANGLES, _AXES = one(number, ("R", "P", "Y")), one(number, ("X", "Y", "Z"))
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
 
-# {option or ARGUMENT: form of its value}; all other options are switches.
+# {option or ARGUMENT: form of its value}. Options that are not listed are switches.
 FORMS: dict[str, Form] = {
     "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
     "URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"},
@@ -224,7 +225,7 @@ class Command(argparse.ArgumentParser):
     """Parser of a command that reports errors in one line."""
 
     def add(self, title: str, options: Mapping[str, str], forms: Mapping[str, Form]) -> None:
-        """Add a group of options {name: help}; `forms` are the forms of their values."""
+        """Add a group of `options` {name: help}, whose values have the `forms` {name: form}."""
         groups = {"": self, **{each.title: each for each in self._action_groups}}
         group = groups.get(title) or self.add_argument_group(title)
         for name, about in options.items():
@@ -248,11 +249,11 @@ class Command(argparse.ArgumentParser):
                 group.add_argument("--force", help=_FORCE, action="store_true")
 
     def _print_message(self, message: str, file: object = None) -> None:
-        # argparse would ignore errors in writing a help text, so the text is written here.
+        # Print the text here, because argparse would ignore an error in writing it.
         print(message, end="", flush=True)
 
     def error(self, message: str) -> NoReturn:
-        """Report invalid arguments in one line, explain missing arguments, and exit."""
+        """Report invalid or missing arguments in one line, and exit."""
         if "required: DISPERSIONS" in message:
             message += "; DISPERSIONS is a TOML file with lines such as [dispersions] and "
             message += '"base.mass" = 0.05'
@@ -269,7 +270,7 @@ def print_error(line: str) -> None:
 
 
 class Help(argparse.Action):
-    """Option that prints the short help, or the full help if its value is `all`."""
+    """Option --help, which prints the short help; --help all prints help for all options."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, _: object, value: object, *__: object
@@ -281,7 +282,7 @@ class Help(argparse.Action):
 
 
 def short_help(command: argparse.ArgumentParser) -> str:
-    """Return a short help: the first sentence about each common option of a command."""
+    """Return the short help, with the first sentence about each common option of a command."""
     arguments = [each for each in command._actions if not each.option_strings]
     _, *every = (each for each in command._actions if each.option_strings)
     options = {each.dest.replace("_", "-"): each for each in every}
@@ -319,7 +320,7 @@ def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[tuple[Path
 
 
 def settle_former_names(arguments: argparse.Namespace) -> None:
-    """Set the time options that are given under their former names, with a warning."""
+    """Accept the former names --step and --dt of --dt and --sample, with a warning."""
     if (step := getattr(arguments, "step", None)) is not None:
         said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:

@@ -1,4 +1,4 @@
-"""Robot, operating point and linear models that the arguments of a command define."""
+"""Functions that build the robot, operating point and linear models of a command."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ T = TypeVar("T")
 
 
 def load_robot(arguments: Namespace) -> fflin.Robot:
-    """Load the robot with the joints, inputs, outputs, gravity and orbit of the arguments."""
+    """Load the robot, and apply the options that override its settings."""
     given = {
         name: value
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    # These settings change the warnings of `load`.
+    # Give these settings to `load`, because its warnings depend on them.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
@@ -63,19 +63,19 @@ def _inputs(robot: fflin.Robot, name: str) -> tuple[Input, ...]:
 def limits_of_options(
     arguments: Namespace,
 ) -> list[str | dict[str, float]] | dict[str, float] | None:
-    """Return the limits that --limits and --limit define."""
+    """Return the limits that the options --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 
 
 def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
-    """Raise an error if options are given that have no effect in combination with others."""
+    """Raise an error if any option in `names` is given; `why` explains why it has no effect."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
-    """Return {name: value} of a repeatable option; raise an error if a name is given twice."""
+    """Return the values of a repeatable option by name; raise an error if a name is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
@@ -87,12 +87,12 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
 def state_of(
     robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None]:
-    """Return q (nq,) and v (nv,) of a robot's state, which the options of a command override.
+    """Combine states of a robot and the options of a command; return q (nq,) and v (nv,).
 
-    Of several states, the last has precedence.
+    Later states override earlier states, and options override all states.
 
-    The options --joint, --rpy, --position and --velocity may have a prefix, such as ``target_``.
-    Warn about exceeded limits of joints.
+    The options are --joint, --rpy, --position and --velocity. Their names may have a prefix, such
+    as ``target_``. A joint outside its limits causes a warning.
     """
     from fflin.dynamics.points import base_of, combined
 
@@ -130,7 +130,8 @@ def point_of(
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
     """Return q (nq,), v (nv,) and the reference of an operating point; see `state_of`.
 
-    With --relative-equilibrium, they are at the pose of the relative equilibrium.
+    With --relative-equilibrium, the base pose is the pose of that equilibrium, which is also the
+    reference.
     """
     number = getattr(arguments, "relative_equilibrium", None)
     if number:
@@ -144,7 +145,7 @@ def point_of(
 
 
 def reference_of(arguments: Namespace) -> pin.SE3 | None:
-    """Return the pose of --reference; None is the base pose at the operating point."""
+    """Return the reference from --reference; None is the base pose at the operating point."""
     import pinocchio as pin
 
     return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
@@ -161,7 +162,7 @@ def linear_model(
 def model_about(
     robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
 ) -> fflin.LinearModel:
-    """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium."""
+    """Linearise about q (nq,) and v (nv,), with inputs from --effort or --equilibrium."""
     axes = {"frame": arguments.frame, "reference": reference}
     if arguments.relative_equilibrium or arguments.equilibrium:
         by = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"

@@ -16,11 +16,11 @@ from fflin.base.tables import first_paragraph, headed
 from fflin.base.writing import followed_path
 from fflin.commands import DONE
 
-# The report includes the size of files with these endings.
+# For files with these endings, the report shows the file size.
 _PAGES = (".html", ".gif")
 
 
-# Entries that identify the kind of a result if its file does not state the kind.
+# Entries by which the kind of a result is recognised if its file does not state the kind.
 _ENTRIES = {
     "Sensitivity": {"urdf_sha256", "dA", "dB"},
     "LinearModel": {"urdf_sha256", "certificate"},
@@ -39,12 +39,12 @@ class Report:
     robot : str or None
         Name of the robot.
     result : object
-        Result of the library, or a mapping, whose fields --json prints.
+        Result of the library, or a mapping; --json prints its fields.
     text : str
         Report without --json. Its first paragraph is the entry "result" of --json.
     files : mapping
-        {path: function that writes the file, or None if the file is already written}. A path None
-        is ignored.
+        {path: function that writes the file, or None if the file is already written}. An entry with
+        the path None is ignored.
     code : int
         Exit code.
     interrupted : str
@@ -63,8 +63,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
     """Write the files of a report, print the report, and return the exit code."""
     command, said = arguments.command.prog.split()[-1], [report.interrupted]
     written: list[Path] = []
-    # Files are written first, so that a closed pipe cannot prevent writing them. The report is
-    # also printed if writing a file fails.
+    # Write the files before the report is printed, so that a closed pipe cannot prevent writing
+    # them. If writing a file fails, the report is still printed.
     try:
         for path, write in report.files.items():
             if path is None:
@@ -86,7 +86,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             }
             result = plain(report.result)
             assert isinstance(result, dict)
-            # The entries of every command come first, and are not replaced by the result's.
+            # The common entries come first. An entry of the result with the same name does not
+            # replace them.
             print(json.dumps(head | result | head, allow_nan=False))
         else:
             lines = [headed(command, report.text)]
@@ -100,7 +101,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
 
 
 def plain(value: object) -> object:
-    """Convert a value for JSON: arrays to lists, results to objects, infinity and NaN to null."""
+    """Convert a value for JSON: arrays to lists, results to objects, and inf or NaN to null."""
     import numpy as np
 
     if isinstance(value, np.ndarray | np.generic):
@@ -116,7 +117,7 @@ def plain(value: object) -> object:
 
 
 def _fields(value: object) -> object:
-    """Return the fields of a result; a result that can be saved has the fields of its file."""
+    """Return the fields of a result; if it can be saved, return the entries of its file."""
     from fflin.base.record import Design, record_of
     from fflin.linear.files import record_of as record_of_model
 
@@ -126,7 +127,7 @@ def _fields(value: object) -> object:
         return record_of(value)
     if is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
-        # The model in a result is omitted, because it is a separate result.
+        # Omit linear models, because they are results of their own.
         return {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
     return value._asdict() if hasattr(value, "_asdict") else value
 

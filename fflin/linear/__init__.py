@@ -1,4 +1,4 @@
-"""Linear models A, B, C, D about a point or along a motion, and their verification.
+"""Linear models A, B, C, D about a point or along a trajectory, and their verification.
 
 `linearization` prepares the equations and `state_equations` assembles them. `check` and `nonlinear`
 compute the same matrices independently.

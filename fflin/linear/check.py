@@ -1,4 +1,4 @@
-"""Check of A and B by ABA derivatives and by differences of the nonlinear model."""
+"""Check of A and B by ABA derivatives and by finite differences of the nonlinear model."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -38,30 +38,31 @@ class Row(NamedTuple):
 
 
 _EPS = float(np.finfo(float).eps)
-# Rounding error [ulp] of a finite difference of outputs: its weights add two ulp, and the outputs
-# the rest.
+# Assumed rounding error [ulp] of a finite difference of outputs. Two ulp come from the weights of
+# the difference, and the rest from the outputs.
 _ULPS = 8.0
 
-# Rounding error [ulp] of the accelerations in a finite difference.
+# Assumed rounding error [ulp] of a finite difference of accelerations.
 _STEP_ULPS = 64.0
 
-# Tolerances for the analytic computation, relative to the largest entry of a block. The first is
-# the least tolerance, for a well-conditioned M. The second is multiplied by the condition number
-# of M, and allows for a long chain of operations.
+# Tolerances for the comparison with ABA derivatives, relative to the largest entry of a block. The
+# first applies to a well-conditioned M. The second is multiplied by the condition number of M; the
+# larger result applies.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# Tolerances for sixth-order finite differences. Their step size costs about four more digits.
+# The same two tolerances for sixth-order finite differences. They are larger, because division by
+# the small step amplifies rounding errors.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
-# Assumed ratio of the error of ABA's derivatives to the residual of ABA's M^-1.
+# Largest expected error of ABA's derivatives, as a multiple of the residual of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
-# Largest tolerance, even for an ill-conditioned M. With a larger one, the check would confirm
+# Upper bound of all tolerances, even for an ill-conditioned M. A larger tolerance would confirm
 # fewer than two digits.
 _LOOSEST = 1e-2
 
-# Terms that cancel exactly still leave rounding errors of 1e-16 of their size. Errors are
-# therefore relative to a scale that includes this fraction of such terms. It allows for the
-# rounding errors and hides no larger ones.
+# Large terms that cancel in exact arithmetic leave rounding errors of about 1e-16 of their size.
+# Errors are therefore relative to a scale that includes this fraction of such terms. The fraction
+# is so small that the scale does not hide larger errors.
 _ROUNDING_FRACTION = 1e-3
 
 
@@ -103,7 +104,7 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        """Return a text with the verdict, and with the largest error of each kind of comparison."""
+        """Show whether the model is verified, and the largest error of each kind of comparison."""
         if failures := self.failures:
             names = [f"{row.block} ({row.test})" for row in failures[:6]]
             names += ["..."] * (len(failures) > 6)
@@ -171,7 +172,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
 
 def held_to(tolerance: float | None, found: Check) -> Check:
-    """Replace the tolerance of every error in a check by the given one; None changes nothing."""
+    """Replace all tolerances of a check by `tolerance`; with None, return the check unchanged."""
     if tolerance is None:
         return found
     rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
@@ -179,7 +180,7 @@ def held_to(tolerance: float | None, found: Check) -> Check:
 
 
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
-    """Check many models; return the largest ratio of error to tolerance in each row of errors."""
+    """Check many models; keep the row with the largest error / tolerance for each comparison."""
     worst: dict[tuple[str, str], Row] = {}
     for lin in models:
         for row in _checked(robot, lin).rows:
@@ -201,15 +202,15 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    # If links are far apart, ABA loses digits that M retains. ABA's derivatives are as inaccurate
-    # as its M^-1, and the error of M^-1 is the residual of M M^-1 = I.
+    # If links are far apart, ABA is less accurate than M. The error of ABA's derivatives is
+    # estimated from the error of its M^-1, which is the residual of M M^-1 = I.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = _rows("ABA derivatives", scales.errors(A, B), by_aba)
 
     model, nx, steps = Nonlinear(aba, lin), state.nx, scales.difference_steps()
     point = np.concatenate((lin.x0, lin.u0))
-    # Only over the attitude and the joint positions does f have terms beyond second order.
+    # f is at most quadratic in every variable except the attitude and the joint positions.
     bends = np.zeros(len(point), dtype=bool)
     bends[state.groups.q_b] = bends[state.groups.q_m] = True
     slopes = jacobian(model.rates, point, steps, bends)
@@ -223,7 +224,7 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
     rows += _rows("point", scales.rate_errors(model.rates(point[None])[0]), route)
 
-    # With the default inputs, M^-1 is the lower half of B.
+    # If the inputs are the default ones, the lower half of B is M^-1.
     inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
     scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
     scaled = scale[:, None] * inverse * scale
@@ -244,7 +245,7 @@ def _rows(test: str, errors: Mapping[str, float], tolerance: float) -> list[Row]
 def _output_errors(
     model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float
 ) -> dict[str, float]:
-    """Compare C, D and y0 with differences of the nonlinear outputs; return their errors."""
+    """Return the errors of C, D and y0, compared with differences of the nonlinear outputs."""
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
         errors = {"y0": lin.y0 - lin.x0, "C": lin.C - np.eye(nx), "D": lin.D}
@@ -257,7 +258,7 @@ def _output_errors(
 
         here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
         errors = {"y0": (lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-        # A derivative is noise if it is smaller than the rounding error of y divided by the step.
+        # A derivative is only noise if it is smaller than the rounding error of y / step.
         noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
         for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
             largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
@@ -266,7 +267,7 @@ def _output_errors(
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
-    """Return the residuals of a continuous-time model of this robot."""
+    """Return the certificate of a continuous-time model: its errors compared with ABA."""
     aba = Aba(StateMap(robot, reference=lin.reference, frame=lin.frame))
     A, B, _ = aba_route(aba, lin.q, lin.v, lin.u0, moving=lin.moving)
     errors = Scales(aba, lin, lin.M, B).errors(A, B)
@@ -316,18 +317,18 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
 def aba_route(
     aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return A and B from ABA's derivatives by (4.9) and (15.3), and M^-1 by ABA."""
+    """Return A and B, computed from ABA's derivatives by (4.9) and (15.3), and ABA's M^-1."""
     state = aba.state
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Pinocchio differentiates about the world's origin, and a base far from it would cost digits.
-    # So the base is placed at the origin: no derivative depends on its position, not even in
+    # Pinocchio differentiates about the world's origin, so a distant base would reduce the
+    # accuracy. Place the base at the origin, because no derivative depends on its position, even in
     # orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
-    # Upper half of A: kinematics of the tangent displacement in axes that rotate with the base.
+    # Upper half of A: kinematics of a small displacement, in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
@@ -338,17 +339,18 @@ def aba_route(
 
 
 class Scales:
-    """Sizes of the terms of a model at its point, to which the errors of A and B are relative.
+    """Magnitudes of the terms of a model, by which the errors of A and B are divided.
 
-    M (6 + n, 6 + n) and B (nx, nu) are independent of the matrices of the model.
+    M (6 + n, 6 + n) and B (nx, nu) are computed independently, not taken from the model.
     """
 
     def __init__(self, aba: Aba, lin: LinearModel, M: Array, B: Array) -> None:
         self._state = state = aba.state
         self._inputs, self._lin, self._nv = aba.actuation.groups, lin, len(M)
-        # In orbit, the terms that cancel contain the inertial velocity.
+        # In orbit, terms with the inertial velocity cancel, so their size depends on this velocity.
         self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
-        # sqrt((M^-1)_ii) (6 + n,), and sqrt(b^T M^-1 b) (nu,) for the force b of each input.
+        # Mobilities: sqrt((M^-1)_ii) (6 + n,) of each coordinate, and sqrt(b^T M^-1 b) (nu,) of
+        # each input, where b is the generalised force per unit of the input.
         self._mobility = np.sqrt(np.linalg.inv(M).diagonal())
         lower = B[-self._nv :]
         inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
@@ -357,15 +359,15 @@ class Scales:
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
     ) -> dict[str, float]:
-        """Compare with other A and B; return the errors of blocks such as "A[q_b, q_m]".
+        """Compare the model with other A and B; return errors of blocks such as "A[q_b, q_m]".
 
-        `steps` (nx,) are the steps of the differences by which A and B were computed, and
-        `rounding` is the rounding error of these differences.
+        If A and B were computed by finite differences, `steps` (nx,) are their steps, and
+        `rounding` is their rounding error relative to the tolerance.
         """
         # Errors are relative to the largest entry of a block. Rows of accelerations are divided by
-        # the mobility, so that a light joint does not hide a heavy one. Columns of B are divided by
-        # the mobility of their input. If large terms cancel in a block, errors are relative to
-        # these terms, because the terms' rounding errors remain in the differences.
+        # the mobility of their coordinate, so that a light joint does not hide the error of a heavy
+        # joint. Columns of B are divided by the mobility of their input. If large terms cancel in a
+        # block of A, errors are relative to these terms, because their rounding errors remain.
         state, lin, nv = self._state, self._lin, self._nv
         terms = self._cancelling_terms(self._v)
         if steps is not None:
@@ -384,12 +386,13 @@ class Scales:
         return errors
 
     def _cancelling_terms(self, v: Array) -> Array:
-        """Return the size (6, 6) of the terms that may cancel, for each block of the scaled A."""
-        # The base's linear velocity counts only through the rounding errors that it causes in
-        # Pinocchio's derivatives.
+        """Return the size (6, 6) of the terms that may cancel in each block of the scaled A."""
+        # The base's linear velocity is reduced by _ROUNDING_FRACTION, because it causes only
+        # rounding errors in Pinocchio's derivatives.
         mobility, lin = self._mobility, self._lin
         speed, rate, momentum = self._speeds(v)
-        # Gyroscopic torque of the wheels on a rotating link, in the units of the rows.
+        # Gyroscopic torque of the wheels per unit rate of their link, in the units of the scaled
+        # rows.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
         slowed = speed.copy()
         slowed[LINEAR] *= _ROUNDING_FRACTION
@@ -399,8 +402,8 @@ class Scales:
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
-        # Effect of a unit velocity at the present rates; for rotations, also at the present speed
-        # of the base.
+        # Derivatives of the velocity-dependent accelerations over the velocities, at the present
+        # rates. For angular velocities, they also contain the present linear velocity of the base.
         turning = rate * np.array([_largest(x) for x in np.split(unit, (3, 6))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
@@ -408,7 +411,7 @@ class Scales:
         return terms
 
     def _speeds(self, v: Array) -> tuple[Array, float, float]:
-        """Return speeds (6 + n,) with wheels at 0, the largest rate, and the wheels' momentum."""
+        """Return speeds (6 + n,), 0 for wheels; the largest rate; and the wheels' momentum."""
         speed, robot = np.abs(self._state.velocities(v)), self._state.robot
         momentum = 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -420,7 +423,7 @@ class Scales:
         return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
     def rate_errors(self, f0: Array) -> dict[str, float]:
-        """Compare with another f0, relative to its largest terms, which may cancel."""
+        """Compare the model with another f0, relative to the largest terms that f0 sums."""
         mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
         push = _largest(self._lin.u0 * self._input_mobility)
         push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)
@@ -431,15 +434,15 @@ class Scales:
         return errors
 
     def difference_steps(self) -> Array:
-        """Return the steps (nx + nu,) for differences in x and u at the model's point."""
+        """Return the steps (nx + nu,) of finite differences over x and u at the model's point."""
         state, lin, nv = self._state, self._lin, self._nv
-        # The step is small compared with the rotations over which the accelerations of aligned
-        # light links change.
+        # The accelerations of light, aligned links change over small rotations. The step is smaller
+        # than these rotations.
         step = np.full(2 * nv, 2e-4)
-        # The step stays well inside the chart: f becomes steep near the limit |q_b| = 1.
+        # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
         step[state.groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[state.groups.q_b]))
-        # f is quadratic in the velocities and linear in the inputs, so there is no truncation error
-        # at any step size.
+        # f is quadratic in the velocities and linear in the inputs, so these steps can be large
+        # without a truncation error.
         speed = np.abs(lin.x0[-nv:])
         step[-nv:] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
         step[state.groups.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))

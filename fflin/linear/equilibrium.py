@@ -1,4 +1,4 @@
-"""Equilibria: inputs that hold a robot, deflections of springs, and attitudes at rest in orbit."""
+"""Equilibria: inputs and spring deflections at rest, and attitudes at rest in an orbit."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
 
-# Rounding errors of M a, of the accelerations and of the principal moments of inertia, relative to
-# the summed terms.
+# Rounding error of M a, of accelerations and of principal moments of inertia. It is relative to the
+# terms that are summed.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -205,7 +205,7 @@ def equilibrium(
 
 
 class _Balance:
-    """Minimum-norm inputs at a point, in base axes, and the residual forces."""
+    """Balance of forces at a point: minimum-norm inputs, in base axes, and residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -216,7 +216,7 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        # Bounds (6 + n,) of the rounding errors that cancelling terms leave in the forces.
+        # Bounds (6 + n,) of the rounding errors that remain in the forces if large terms cancel.
         state, springs = linearizer.prepared.map, robot.springs
         absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         speed = np.abs(state.velocities(absolute))
@@ -281,7 +281,7 @@ TOLERANCE = 1e-9
 
 
 def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Array, Array]:
-    """Return the minimum-norm u with ``C u = d`` and ``u[one_sided] >= 0``, and ``C u - d``."""
+    """Minimise ``|C u - d|`` for ``u[one_sided] >= 0``; return u of least norm and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest
@@ -289,8 +289,8 @@ def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Arra
         least, most = np.full((2, len(u)), [[-np.inf], [np.inf]])
         least[one_sided] = 0.0
         bounded = nearest(C, d, least, most)
-        # Solve again for the nonzero inputs alone, without bounds. This removes the rounding
-        # errors of the bounded solution.
+        # Solve again without bounds, with only the two-sided and the nonzero one-sided inputs. This
+        # removes the rounding errors of the bounded solution.
         pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
         u = np.zeros(len(u))
         u[pushing] = _pseudo_solve(C[:, pushing], d)
@@ -459,7 +459,7 @@ def relative_equilibria(
 
 
 def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of the attitude motion, and the smallest margin of stability."""
+    """Return the poles (6,) of the attitude motion, and its stability margin in rounding errors."""
     radial, along, normal = moments.tolist()
     pitch = 3.0 * (along - radial) / normal
     k_a, k_r = (normal - radial) / along, (normal - along) / radial

@@ -1,4 +1,4 @@
-"""Conversion of linear models to and from the coordinates of other tools: (15.1) to (15.6)."""
+"""Conversion of linear models between fflin and other tools, by (15.1) to (15.6)."""
 
 from __future__ import annotations
 
@@ -182,11 +182,12 @@ class ToolGain(Design):
 
 
 def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
-    """Convert a gain K of a model to a tool's coordinates; the closed-loop poles do not change."""
+    """Convert a gain K of a model to a tool's coordinates, with the same closed-loop poles."""
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # An input that is constant in the axes of the model rotates in the axes of the tool (15.4).
+    # The axes of the tool rotate relative to the axes of the model, so a constant input of the
+    # model varies with the attitude in the tool (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
 
@@ -280,7 +281,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the Jacobians of the model and of the tool, and dy/dt."""
+    """Return a tool's coordinates, both Jacobians (of the model, of the tool), and dy/dt."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -312,7 +313,7 @@ def _step(tool: str, dt: float | None) -> float:
 
 
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a semi-implicit Euler step (15.6), with linear before angular rows."""
+    """Return A, B and f0 of a semi-implicit Euler step (15.6); linear rows precede angular rows."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)

@@ -1,10 +1,10 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
-A model in csv consists of several tables for other programs, which fflin does not read: one for
-each matrix, with names of rows and columns; one each for the states, inputs and outputs; and the
-table ``info`` of all other entries. In a trajectory in csv, every row of the last column repeats
-the digest of the other columns. So the file has no extra lines, and other programs can read the
-columns by their names.
+A model in csv consists of several tables. They are for other programs; fflin does not read them.
+There is one table for each matrix, with the names of its rows and columns. There is one table each
+for the states, inputs and outputs, and the table ``info`` for all other entries. A trajectory in
+csv is one table. Its last column contains the digest of the other columns, repeated in every row.
+The file therefore has no extra lines, and other programs can read it by column names.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 FORMATS = (*record.FORMATS, ".csv")
 
 _SIGNALS = ("state", "input", "output")
-# Arrays of a model in a file: {field: kind of name along each dimension}.
+# Arrays of a model in a file: {field: which names label each dimension}.
 _ARRAYS: dict[str, tuple[str, ...]] = {
     "A": ("state", "state"),
     "B": ("state", "input"),
@@ -83,7 +83,7 @@ def record_of(lin: LinearModel) -> Record:
 
 
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
-    """Write the record of a model, with its digest if `checksummed`; see `LinearModel.save`."""
+    """Write the entries of a model, and their digest if `checksummed`; see `LinearModel.save`."""
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
         record.write_record(path, entries, checksummed=checksummed)
@@ -146,12 +146,12 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
 
 
 def given(value: T, _: object) -> T:
-    """Return an entry of a file unchanged."""
+    """Return an entry unchanged."""
     return value
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that saving NAME.csv would overwrite and that no model wrote, or None."""
+    """Return a file that saving NAME.csv would overwrite and that contains no model, or None."""
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
@@ -188,7 +188,7 @@ def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
 
 
 def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
-    """Return the arguments of `Trajectory` from a file, see `Trajectory.load`."""
+    """Read the arguments of `Trajectory` from a file; see `Trajectory.load`."""
     check_ending(source, FORMATS)
     with reading(source, "trajectory"):
         table = source.suffix == ".csv"
@@ -205,7 +205,7 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
 def arguments(
     entries: Record, robot: Robot, hold: str | None, frame: str, verified: bool
 ) -> dict[str, Any]:
-    """Return the arguments of `Trajectory` from named entries: t, u, and q, v or x."""
+    """Return the arguments of `Trajectory` from the entries t and u, and either q and v, or x."""
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
         found = ", ".join(sorted(entries))
@@ -278,8 +278,8 @@ def _entries(columns: Record, robot: Robot) -> Record:
     require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
-    # The last row of inputs may be empty: inputs that are constant between knots have no value
-    # there.
+    # The last row may lack inputs, because inputs that are constant between knots have no value at
+    # the last knot.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
         entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])

@@ -1,4 +1,4 @@
-"""Checks that a model or design made for one robot fits another, by names and units."""
+"""Checks that a model or design fits a robot: its names and units must be equal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
     """Raise `InputError` if a model's states or inputs differ from the robot's.
 
-    A reduced model may lack states of the robot, unless the model must be `whole`.
+    A reduced model, which lacks states of the robot, is accepted unless `whole` is True.
     """
     made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
     own, there = (lin.state_names, lin.state_units), (state.names, state.units)

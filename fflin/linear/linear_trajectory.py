@@ -232,7 +232,7 @@ def linearize_trajectory(
 
 
 def along(motion: Trajectory) -> LinearTrajectory:
-    """Return the linear models along a motion."""
+    """Linearise about all knots of a trajectory."""
     linearizer = Linearizer(motion.robot, moving=True)
     found: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
     for key in ("state_names", "input_names", "output_names"):
@@ -244,15 +244,16 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# Steps are halved until the transition matrix of a sample has this accuracy.
+# Steps are halved until the transition matrix of a sample has the accuracy _ACCURACY, or until an
+# interval between knots has _MOST_PARTS parts.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# Number of samples that one call integrates.
+# Number of samples that are integrated together.
 _BATCH = 64
 
 
 class Steps(NamedTuple):
-    """Steps (m,) through a sample, each with constant F = [[A, B], [0, 0]]."""
+    """The m integration steps of a sample. In each, F = [[A, B], [0, 0]] is constant."""
 
     F: Array  # (m, nx + nu, nx + nu)
     h: Array  # (m,) [s]
@@ -261,7 +262,7 @@ class Steps(NamedTuple):
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
-    """Yield the steps of each sample, and their transition matrices (nx, nx + nu)."""
+    """Yield the steps and the transition matrix (nx, nx + nu) of each sample."""
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
         duration = traj.t[-1] - traj.t[0]
@@ -282,8 +283,8 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
             finer = _through(traj, [batch[k] for k in coarse], parts)
             pending = []
             for k, each in zip(coarse, finer, strict=True):
-                # Half steps reduce the error 16 times. The estimate assumes only 4 times, to be on
-                # the safe side.
+                # Halving the steps divides the error by 16. The estimate assumes only a factor of
+                # 4, as a safety margin.
                 apart = np.abs(each[1] - found[k][1]).max(axis=0)
                 if not (0.25 * apart <= _ACCURACY * np.abs(each[1]).max(axis=0)).all():
                     pending.append(k)
@@ -292,7 +293,11 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return the steps and the transition matrix of each sample, `parts` steps between cuts."""
+    """Return the steps and the transition matrix of each sample.
+
+    The cuts of a sample are its start, the knots in it, and its end. Each interval between cuts is
+    divided into `parts` parts.
+    """
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
     h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])

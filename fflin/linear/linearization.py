@@ -1,4 +1,4 @@
-"""Linearisation: A, B, C and D about any point."""
+"""Linearisation about any point: computation of A, B, C and D."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from fflin.robot.mass_properties import require_inertia, rotor_names
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Models with a larger sum of squared entries are refused, since their eigenvalues would overflow.
+# Upper bound of the sum of the squared entries. Larger models are refused, because computing their
+# eigenvalues would overflow.
 LARGEST = 1e200
 
 if TYPE_CHECKING:
@@ -37,9 +38,9 @@ _STANDING: Chart = Standing()
 
 
 class Prepared:
-    """Data that all points of linearisation of a robot share; arrays are read-only.
+    """Data of a robot that do not depend on the operating point; arrays are read-only.
 
-    Arguments and errors are as in `Linearizer`.
+    The arguments and errors are documented in `Linearizer`.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class Prepared:
     own_reference : bool
         Whether the reference is the base placement at each point.
     free : bool
-        Whether `common` and `rest` contain all of a model at rest except M^-1.
+        Whether, for a model at rest, `common` and `rest` contain all matrices except the M^-1 in B.
     common : dict
         Fields of a model that are the same at all points.
     rest : dict
@@ -72,7 +73,7 @@ class Prepared:
                 "moving=True measures the error in the axes of the moving base, so no reference "
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
-        # In orbit, the reference is the orbital frame.
+        # In orbit, the default reference is the orbital frame, not the base placement.
         self.own_reference = reference is None and robot.orbit is None
         require_inertia(robot)
         self.actuation = Actuation(state)
@@ -129,7 +130,7 @@ class Prepared:
 
     @property
     def not_compilable(self) -> str:
-        """Reason why the robot has no compiled accelerations, or an empty text."""
+        """Reason why the accelerations cannot be compiled, or an empty text if they can."""
         from fflin.kernel.tree import batch_tree
 
         name = self.robot.name
@@ -142,7 +143,7 @@ class Prepared:
         return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
 
     def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations, unless the robot is `not_compilable`."""
+        """Return the compiled accelerations; `not_compilable` must be empty."""
         from fflin.kernel.derivatives import RowAccelerations
         from fflin.kernel.tree import batch_tree
 
@@ -159,9 +160,10 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # The ignorable coordinates depend on the robot, not on the point. The position is ignorable
-    # because uniform gravity is the same everywhere. Without gravity, the error dynamics do not
-    # depend on the attitude either. In orbit, position and attitude both matter.
+    # The ignorable coordinates are the same at all points. The position is ignorable because
+    # uniform gravity is the same everywhere. Without gravity, the attitude is ignorable too if it
+    # is relative to a moving reference (`lin.moving`). In orbit, the dynamics depend on both
+    # position and attitude.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in rotor_names(robot)))
@@ -259,7 +261,8 @@ class Linearizer:
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         self._rate = "_drift" if ready.moving else "f0"
-        # Fields of a model at rest except B and q; slow ones are computed at their first use.
+        # Fields of a model at rest, except B and q. Expensive fields are computed at their first
+        # use.
         slow = {"x0": ready.state_at, "y0": ready.state_at}
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
@@ -268,14 +271,14 @@ class Linearizer:
             self._fields["_reference"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Without springs, gravity, orbit and stored momentum, all of a model at rest except M^-1
-        # in B is known in advance.
+        # Whether only B must be computed for a model at rest. This requires default inputs, outputs
+        # and reference, and no springs, gravity, orbit or stored momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
     ) -> LinearModel:
-        """Linearise about a point; arguments and errors are as in `linearize`."""
+        """Linearise about a point; see `linearize` for the arguments and errors."""
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
@@ -294,7 +297,7 @@ class Linearizer:
                 return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
-        # A copy needs its own work space, so it is built anew from the constructor's arguments.
+        # A copy cannot share the work space, so the constructor builds it again.
         state, moving = self.prepared.map, self.prepared.moving
         reference = None if self.prepared.own_reference else state.reference
         make = partial(type(self), frame=state.frame, reference=reference, moving=moving)
@@ -354,7 +357,7 @@ class Linearizer:
 
 
 def _require_finite(*arrays: Array) -> None:
-    """Raise `InputError` if the squares of the entries of an array overflow."""
+    """Raise `InputError` if an array has NaN entries or too large a sum of squares."""
     for array in arrays:
         if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(

@@ -163,8 +163,9 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
-    # The fingerprint of a model that was made from another model, and that model, which has the
-    # certificate. A continuous-time model has exact zeros that the matrix exponential loses.
+    # For a model that was made from another model: its fingerprint, and the other model. The other
+    # model has the certificate. Its matrices also have exact zeros, which are lost by the matrix
+    # exponential of a discretisation.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
@@ -173,16 +174,17 @@ class LinearModel(StateSpace):
     mean_motion: float = 0.0
 
     def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
-        # A dataclass would set three dozen frozen fields one by one, which takes as long as the
-        # dynamics of a small robot. Here, most fields are in `shared` for all models of a robot.
+        # The generated __init__ of a frozen dataclass would set three dozen fields one by one,
+        # which takes as long as the dynamics of a small robot. Instead, all models of a robot take
+        # most fields from `shared`.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())
         vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> object:
-        # `shared` may hold {field: function of the model} for fields that are computed at first
-        # access, because they take as long as the dynamics.
+        # `shared["_computed"]` is {field: function of the model}. These fields are computed at
+        # first access, because they take as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
@@ -423,7 +425,7 @@ class LinearModel(StateSpace):
 
 
 def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
-    """Return a `control.StateSpace` of A, B, C, D and names of states, inputs and outputs."""
+    """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
     # python-control reserves dots in signal names for its own system.signal syntax.
     states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
@@ -431,7 +433,7 @@ def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str
 
 
 def refuse_sampled(dt: float, do: str) -> None:
-    """Raise `InputError` if a model has a sampling time; `do` is what the caller does with it."""
+    """Raise `InputError` for a discrete-time model; `do` is the verb for the error message."""
     if dt:
         raise InputError(
             f"the model is already sampled, at dt = {dt:g} s; {do} the continuous-time model "

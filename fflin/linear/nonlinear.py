@@ -1,4 +1,4 @@
-"""Nonlinear model in the chart of a linear model, and its derivatives by differences."""
+"""Nonlinear model in the chart of a linear model, and its derivatives by finite differences."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,8 @@ from fflin.dynamics.integrators import integrate_rows
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
-# Speed of the base [m/s] above which rounding errors of this speed would hide other velocities.
+# Base speed [m/s] whose rounding errors would hide the other velocities. A faster base is described
+# relative to an observer that moves with it.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -30,10 +31,10 @@ _WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
 class Nonlinear:
-    """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, by ABA.
+    """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, computed by ABA.
 
-    If the reference of the linear model moves through its point, x is the error relative to this
-    reference, and f is 0 at the point.
+    If the linear model has a moving reference, x is the error relative to this reference. Then f is
+    0 at the operating point.
     """
 
     def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
@@ -49,7 +50,7 @@ class Nonlinear:
             _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
 
     def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
-        """Return charts, and q, v and dv/dt in Pinocchio's order, of rows (x, u) (N, nx + nu)."""
+        """Return the charts, q, v and dv/dt (Pinocchio's order) for rows (x, u) (N, nx + nu)."""
         x, u = np.split(point, [self.state.nx], axis=1)
         chart, q, v = self.state.points(x)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
@@ -60,10 +61,10 @@ class Nonlinear:
         return chart, q, v, a
 
     def rates(self, point: Array) -> Array:
-        """Return dx/dt (N, nx) of rows (x, u) (N, nx + nu)."""
+        """Return dx/dt (N, nx) for rows (x, u) (N, nx + nu)."""
         state, (chart, _, v, a) = self.state, self.accelerations(point)
-        # edot = (e0 (w - w*) + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r, with v* and w* of
-        # the reference.
+        # Rates of the error relative to a reference with velocities v* and w*: edot = (e0 (w - w*)
+        # + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)
@@ -72,18 +73,19 @@ class Nonlinear:
         position_rate -= times(skew(at_angular), point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
-            # Add the term by which the derivative of the components in reference axes differs.
+            # Components of v in reference axes have another derivative than components in base
+            # axes. Add the difference w x v.
             rate[:, LINEAR] += times(skew(angular), linear)
         rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
         joint_rates = state.velocities(v - self._v)[:, 6:]
         return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
 
     def flow_error(self) -> float:
-        """Return the relative error of f, compared with differentiated states of short motions."""
+        """Return the relative error of f, compared with finite differences along short motions."""
         lin, robot = self._lin, self.state.robot
         state = self.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
         near = Nonlinear(self._aba, lin, state)
-        # The first row is the point itself. In the others, one base velocity differs.
+        # The first row is the point itself. In each other row, one base velocity is increased by 1.
         x = np.tile(lin.x0, (7, 1))
         x[:, state.groups.r_b] = 0.0
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
@@ -108,9 +110,10 @@ class Nonlinear:
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
-    """Return the Jacobian of f by central differences; f maps rows of points to rows of values.
+    """Compute the Jacobian of f by central differences; f maps rows of points to rows of values.
 
-    Columns in the mask `is_curved` use sixth-order differences, the others second-order ones.
+    Columns in the mask `is_curved` use sixth-order differences. All others use second-order
+    differences.
     """
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))

@@ -1,4 +1,4 @@
-"""A, B, f0, C and D, assembled from accelerations, outputs and their derivatives.
+"""Assembly of A, B, f0, C and D from accelerations, outputs and their derivatives.
 
 Equation numbers refer to docs/derivation.md.
 """
@@ -26,11 +26,11 @@ def assemble(
     *,
     moving: bool,
 ) -> Array:
-    """Complete A (.., nx, nx) and the lower half of B at one or many points; return f0 (.., nx).
+    """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
-    On entry, the upper half of A is as at rest, with N in the right block (2.1). `rates.slopes` is
-    a view of the lower half of A, and `rates.by_u` a view of the lower half of B. Both are
-    converted in place from base axes to the chart and the frame.
+    On entry, the upper half of A must have its values at rest: zero, except N in the right block
+    (2.1). `rates.slopes` is a view of the lower half of A, and `rates.by_u` is a view of the lower
+    half of B. This function converts both in place, from base axes to the chart and the frame.
     """
     state = actuation.state
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
@@ -43,13 +43,14 @@ def assemble(
     theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Rows of attitude and position. At the reference, the other blocks are as at rest.
+    # Rows of attitude and position. If the base is at the reference, all blocks that are not set
+    # here have their values at rest.
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
-            # N W J, where N is I/2 and J is 2 I at the reference.
+            # Add N W J. At the reference, this is W, because N = I/2 and J = 2 I.
             by_q_b += W if chart.standing else chart.over_q_b(product(chart.N, W))
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
@@ -58,10 +59,10 @@ def assemble(
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
 
-    # Rows of the accelerations, which are still in base axes.
+    # Convert the rows of the accelerations, which are still in base axes.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # The columns of the base's linear velocity are zero, so they need no rotation.
+        # Rotate no columns of the base's linear velocity, because they are zero.
         chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_columns(actuation.held, rates.by_u)
@@ -88,17 +89,17 @@ def assemble(
 def _over_rotations(
     actuation: Actuation, chart: Chart, u: Array, rates: AccelerationDerivatives, W: Array
 ) -> Array:
-    """Return the derivatives (.., 6 + n, 3) of the accelerations over base rotations (4.4)."""
+    """Differentiate the accelerations over base rotations (4.4); return (.., 6 + n, 3)."""
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn` is the derivative in base axes, and is converted in place. It is zero without an
-    # orbit, and so also if omega is in reference axes.
+    # `by_turn` is the derivative in base axes, which is converted in place. It is nonzero only in
+    # orbit. There, omega is in base axes, so the assignment below discards no nonzero value.
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # Each part has its own name, because `x[part] -= y` would also copy the part onto itself.
+    # Name the parts before changing them: `x[part] -= y` would copy the part onto itself.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
         turning -= skew(c[..., ANGULAR])
@@ -112,7 +113,7 @@ def _over_rotations(
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the state derivative (.., nx) of a moving reference; see below (5.3)."""
+    """Return the state derivative (.., nx) of a moving reference; see the text below (5.3)."""
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
         return f0
@@ -131,7 +132,7 @@ def output_equations(
     x0: Array,
     point: Sequence[Array],
 ) -> dict[str, Array]:
-    """Return C, D and y0 at a point: q, v, and nu (6 + n,) and u (nu,) in base axes."""
+    """Return C, D and y0; `point` is q, v and, in base axes, nu (6 + n,) and u (nu,)."""
     state, a = sensing.state, rates.c.copy()
     q, v, nu, u = point
     if sensing.needs_acceleration:

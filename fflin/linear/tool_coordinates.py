@@ -1,4 +1,4 @@
-"""Conventions of other tools for a free flyer (`TOOLS`), and derivatives of their coordinates."""
+"""Conventions of other tools for a free-flyer (`TOOLS`), and derivatives of their coordinates."""
 
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -15,8 +15,8 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Complex step along a motion. Rounding removes its square from every sum, so derivatives are exact
-# to machine precision.
+# Step of complex-step differentiation along a motion. Its square is lost by rounding in every sum,
+# so the derivatives are exact to machine precision.
 _STEP = 1e-20j
 
 _NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
@@ -24,10 +24,10 @@ _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # all others have rad or rad/s
 
 
 class Convention(NamedTuple):
-    """Convention of a tool for a free flyer."""
+    """Convention of a tool for the coordinates of a free-flyer."""
 
-    # Attitude in x: "wxyz", "q_b", "euler", "tangent" (a rotation vector), or "pose" (a tangent
-    # vector together with the position).
+    # Attitude in x: "wxyz", "q_b", "euler", "tangent" (a rotation vector), or "pose" (one tangent
+    # vector of attitude and position).
     attitude: str
     stored: str  # attitude in q
     angular_first: bool
@@ -47,7 +47,7 @@ TOOLS = {
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of x' and u' at a point, over y (15.1) and over u in base axes."""
+    """Derivatives of a tool's x' and u' at a point, over y (15.1) and over u in base axes."""
 
     P: Array  # dx'/dy (15.2)
     rate: Array  # time derivative of P along the motion
@@ -58,7 +58,7 @@ class Jacobians(NamedTuple):
 
 
 class ToolCoordinates:
-    """Coordinates of a tool, or of a linear model, relative to the reference of a `StateMap`."""
+    """Coordinates of a tool, or of fflin's own models, relative to a `StateMap`'s reference."""
 
     def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
         robot, own = state.robot, not tool
@@ -69,15 +69,16 @@ class ToolCoordinates:
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
         swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular)
-        # The tool's base has the displacement X y, the twist X nu and the wrench X^-T w.
+        # X converts to the tool's base frame: the displacement is X y, the twist X nu and the
+        # wrench X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
         followers = () if own else map(attrgetter("joint"), robot.followers)
         self.joints = sorted((*robot.joints, *followers), key=attrgetter("idx_v"))
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [*map(attrgetter("idx_v"), self.joints)]
-        # Velocity in nu per unit of the tool's velocity; it differs from 1 only for Pinocchio,
-        # which scales modal amplitudes.
+        # Ratio of each velocity in nu to the tool's velocity. It differs from 1 only for Pinocchio,
+        # whose modal amplitudes are scaled.
         self._scales: Array = np.array([*map(attrgetter("scale"), self.joints)])
         if tool and kind.stored == "xyzw":
             self._scales[:] = 1.0
@@ -89,7 +90,7 @@ class ToolCoordinates:
                 "BaseForce needs a BaseTorque for its moment about the origin of the link; give "
                 "the robot a BaseTorque too"
             )
-        # Index of the robot's input for each input of the tool.
+        # For each input of the tool, the index of the robot's input.
         self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
             self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
@@ -126,7 +127,7 @@ class ToolCoordinates:
         return q, v
 
     def to_pinocchio(self, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
-        """Convert the tool's q and v to Pinocchio's q and v; v=None means rest."""
+        """Convert the tool's q and v to Pinocchio's q and v; v=None means zero velocity."""
         robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
@@ -145,7 +146,7 @@ class ToolCoordinates:
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
-        """Return the rotation (3, 3) of the attitude that a tool's q stores."""
+        """Return the rotation matrix (3, 3) of an attitude in the form in which q stores it."""
         if self.convention.stored == "euler":
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
@@ -159,7 +160,7 @@ class ToolCoordinates:
         return turning.rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
-        """Return the quaternion x, y, z, w of the attitude in x', and its rotation matrix."""
+        """Return the attitude in x' as a quaternion x, y, z, w and as a rotation matrix."""
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
@@ -168,16 +169,17 @@ class ToolCoordinates:
         return quaternion, turning.rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
-        """Return the matrix (6, 6) from a twist or wrench in base axes to the tool's axes."""
+        """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes."""
         rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
             rotation[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Differentiate world-fixed vectors in base axes over a base rotation (4.4); return (6, 3).
+        """Differentiate two vectors in base axes over a base rotation (4.4); return (6, 3).
 
-        Vectors that are fixed in base axes have the derivative zero.
+        A vector that the tool expresses in world axes is constant there, so its components in base
+        axes depend on the rotation. Other vectors have the derivative zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
@@ -185,8 +187,8 @@ class ToolCoordinates:
         """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
-        # Take a complex step along the motion. With a moving reference, errors and tangent vectors
-        # stay constant along it.
+        # Take a complex step along the motion. If the reference moves with the robot, attitude
+        # errors and tangent vectors are constant, so their step is zero.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
         turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
@@ -229,7 +231,7 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return the coordinates of a tool; raise an error if the tool cannot describe the robot."""
+    """Return a tool's coordinates of a robot; raise an error if the tool cannot represent it."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -238,7 +240,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement of the root link's centre of mass and inertia axes."""
+    """Return the placement of the frame at the root link's centre of mass, in its inertia axes."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):
@@ -247,7 +249,7 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _joint_path(robot: Robot, name: str) -> list[int]:
-    """Return the file indices of the joints from the root to a joint; other joints come last."""
+    """Return the file indices of the joints from the root to a joint; unlisted joints come last."""
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
@@ -275,7 +277,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G with (angle rates) = G omega, and the derivative of G omega over the angles."""
+    """Return G, by which angle rates = G omega, and the derivative of G omega over the angles."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -1,4 +1,4 @@
-"""Trajectory: motion of a robot given by knots, with constant or linear inputs between knots."""
+"""Motion of a robot given by knots, with constant or linear inputs between the knots."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from fflin import Motion
     from fflin.base.validation import Array, Indices, Vector
 
-# Largest residual up to which knots count as a motion of the robot.
+# Largest residual with which knots are accepted as a motion of the robot.
 _MOTION = 1e-2
 
-# Largest rotation of the base between two knots [rad], so that its direction is unambiguous.
+# Largest rotation [rad] of the base between two knots. Near pi, its direction would be ambiguous.
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
@@ -41,11 +41,11 @@ _CAUSES = (
     "or springs, damping or gravity that differ from the robot"
 )
 
-# Steps are halved until the end of an interval has this accuracy, relative to the largest rates.
-# There are at most _MOST_STEPS steps.
+# Steps are halved until the state at the end of an interval has the accuracy _ACCURACY, relative to
+# the largest rates, or until there are _MOST_STEPS steps.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Rounding errors of positions, and of accelerations relative to the summed terms.
+# Rounding errors: of positions, and of accelerations relative to the terms that they sum.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
@@ -155,7 +155,7 @@ class Trajectory(Design):
         )
 
     def _report(self) -> str:
-        """Return a text about the trajectory, with its residual as a motion of the robot."""
+        """Describe the trajectory, with its residual or the reason why it is not a motion."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         return folded([repr(self), said, *self._note.splitlines()])
 
@@ -212,7 +212,7 @@ class Trajectory(Design):
         return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
-        """Return the inputs in the axes of `frame`, at a fraction of the intervals k."""
+        """Return the inputs, in the axes of `frame`, at a fraction (0 to 1) of the intervals k."""
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
 
@@ -346,9 +346,9 @@ class Trajectory(Design):
 
         The error is infinite if the integration overflows.
         """
-        # Rates are relative to an observer who moves at the base's median velocity (Galilean
-        # invariance), and each rotor has its own scale. So neither a high orbital velocity nor a
-        # fast wheel hides an error.
+        # Velocities are relative to an observer who moves at the base's median velocity (Galilean
+        # invariance), so a high orbital velocity does not hide an error. Each rotor has its own
+        # scale, so a fast wheel does not hide an error either.
         t, u, state = self.t, self.u, self._aba.state
         rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -361,7 +361,7 @@ class Trajectory(Design):
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
         terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
-        # The largest magnitudes; infinite or NaN entries count as zero.
+        # Largest magnitudes over all knots; infinite or NaN entries count as zero.
         push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
         rotors = rotor_names(state.robot)
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
@@ -377,8 +377,8 @@ class Trajectory(Design):
             return float(np.maximum(miss, jump).max())
 
         found, steps, model = [], 1, self.robot.model
-        # If the knots are not a motion of the robot, the integration may diverge. The residual
-        # shows it.
+        # If the knots are not a motion of the robot, the integration may overflow. The residual
+        # shows this, so NumPy need not warn.
         with np.errstate(all="ignore"):
             for k, h in enumerate(np.diff(t).tolist()):
                 steps = max(1, steps // 4)
@@ -417,8 +417,8 @@ class Trajectory(Design):
             end = self._aba.accelerations(q[1:], v[1:], u)
         apart = np.array([pin.difference(model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
-        # The knots give the angle of a wheel only up to full turns. The wheel's speed gives the
-        # number of turns.
+        # The knots give the angle of a wheel only modulo full turns. Compute the number of full
+        # turns from the wheel's speed.
         turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
         apart[:, wheels] += 2.0 * np.pi * np.round(turns)
         slopes = [
@@ -447,7 +447,7 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
-    """Return the indices (k,) of the intervals that contain times (k,), and elapsed fractions."""
+    """Return, for each of the `times` (k,), the index of its interval and the elapsed fraction."""
     k = t[1:-1].searchsorted(times, "right")
     fraction = (times - t[k]) / (t[k + 1] - t[k])
     ends = (fraction > 1.0 - _NEAR) & (k < len(t) - 2)
@@ -456,7 +456,7 @@ def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
 
 
 def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from values and derivatives."""
+    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from end values and rates."""
     apart = last - first
     return np.stack(
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
@@ -464,7 +464,10 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
 
 
 def along(motion: Motion, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory with constant or linear inputs, whichever fits better."""
+    """Convert a motion to a trajectory with constant or linear inputs.
+
+    Of the two, the inputs with the smaller residual are chosen.
+    """
     if motion.phases:
         raise InputError(
             "the motion has several phases, each with its own robot; convert each phase separately"

@@ -1,4 +1,4 @@
-"""Simulation of the nonlinear closed loop, and its result, a `Motion`.
+"""Simulation of the nonlinear closed loop. Its result is a `Motion`.
 
 Imports `base`, `robot`, `dynamics`, `linear` and `control`.
 """

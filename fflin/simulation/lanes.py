@@ -1,6 +1,7 @@
-"""The compiled engine: its choice, the arrays of a plan, and the loop over eight runs at once.
+"""The compiled engine, which simulates eight runs in parallel.
 
-Each run has a lane. If there is only one run, all lanes compute it.
+Each run has a lane, the last axis of the arrays. If there are fewer runs, the remaining lanes
+repeat the last run.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,21 +29,21 @@ from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_co
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
-# Number of steps above which a single run uses the compiled loop, if its machine code is stored.
+# With more steps, a single run uses the compiled loop, if its machine code is already stored.
 LONG = 20_000
 
 SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
-# {name of an array of the loop: values of N runs (N, size)}; see `Dispersions.in_lanes`.
+# {name of an argument of the loop: its values (N, size) in N runs}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
 def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
-    """Return the requested engine for a plan, or choose an engine.
+    """Return the name of the requested engine, or choose an engine for a plan.
 
-    Many runs use the compiled loop if it supports the plan. A single run uses it only if the run is
-    long and the machine code is stored already.
+    By default, many runs use the compiled loop if it supports the plan. A single run uses it only
+    if the run is long and the machine code has been stored by an earlier run.
     """
     if checked_engine(engine) == "python":
         return "python"
@@ -87,7 +88,7 @@ def noise_generator(seed: float) -> np.random.Generator:
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
-    """Return the samples (k,) between two steps, and the policy's noise (k, size) at them."""
+    """Return the indices (k,) of the samples between two steps, and their noise (k, size)."""
     times = plan.times
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
@@ -98,13 +99,13 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]
 
 
 class Statistics:
-    """Statistics of eight parallel runs, updated after each slice of steps; here, none."""
+    """Base class for statistics of eight parallel runs; this class collects none."""
 
     every = 1  # steps from one row to the next
     span = 4096  # steps between checks of `over`, and for Ctrl-C
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of the runs that end early at these q and v (LANES, ..)."""
+        """Return the mask (LANES,) of the runs that must end early, from their q and v."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
@@ -117,15 +118,15 @@ class Statistics:
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of the runs after `done` steps; `stop` are indices into STOPS."""
+        """Return the outcomes after `done` steps; `stop` has an index in STOPS for each lane."""
         return {}
 
 
 class LaneLoop:
-    """The compiled loop over a plan. Threads cannot share it, because it has its own work space.
+    """The compiled loop for a plan. Each thread needs its own, because it contains work space.
 
-    `parts` are the laned arguments of the loop. A row consists of q, nu, u, momentum and centre of
-    mass, which end at the columns `ends`.
+    `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
+    u, momentum and centre of mass. These five parts end at the columns `ends`.
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
@@ -138,7 +139,7 @@ class LaneLoop:
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
-        # Laned arrays, each with the column of its initial values.
+        # Pairs of an array with one column per lane, and the column of its initial values.
         self._fresh: list[tuple[Array, Array]] = []
         self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
         self._words = words_of(self.parts, loop.ARGUMENTS)
@@ -153,12 +154,12 @@ class LaneLoop:
             **robot.faults._asdict(),
         }
 
-    # A diverging motion overflows before it is stopped, so NumPy need not warn.
+    # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
-        """Simulate up to eight runs, the plan's own by default, and return why each was stopped.
+        """Simulate up to eight runs, by default the plan's own run; return why each was stopped.
 
-        The outcomes of the statistics are written into the rows of `out`.
+        Row i of each array in `out` receives the outcome of run i.
         """
         times, every, point = self._plan.times, statistics.every, self.parts.point
         steps, count = times.steps, len(next(iter(out.values()))) if out else 1
@@ -167,7 +168,7 @@ class LaneLoop:
         statistics.reset()
         most = max(1, min(-(-steps // every), _MEMORY // (8 * LANES * self.width)))
         space = work_space(most * self.width)
-        # A slice of count * every steps contains count recorded steps, wherever it begins.
+        # A slice of most * every steps contains `most` recorded steps, wherever it begins.
         span = min(most * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)
@@ -196,7 +197,8 @@ class LaneLoop:
                     continue
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
-                # A finished run would stop all lanes, so its lane continues as a copy of another.
+                # The loop would stop all lanes for a finished run. Its lane therefore continues as
+                # a copy of a running lane.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:
@@ -206,7 +208,7 @@ class LaneLoop:
         return messages
 
     def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
-        """Write the initial values of runs, and return a function that writes sensor errors."""
+        """Write the initial values of all runs; return a function that writes sensor noise."""
         for array, initial in self._fresh:
             array[:] = initial
         for name, values in runs.items():
@@ -238,7 +240,7 @@ class LaneLoop:
         return sense
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
-        """Write into `out` the outcomes of the runs that end at the current step."""
+        """Write the outcomes of the runs that end at the current step into `out`."""
         point, kept, count = self.parts.point, self.parts.reference, len(ending)
         conserved = kept.start[:9] + kept.sums[:9]
         conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
@@ -253,7 +255,7 @@ class LaneLoop:
 
 
 class LaneRows(Statistics):
-    """Recorded rows of a single run, one for each `every` steps, with the columns of the loop."""
+    """Recorded rows of a single run: one row every `every` steps, with the columns of the loop."""
 
     def __init__(self, times: Times, width: int) -> None:
         self.every, self.kept = times.every, np.empty((times.rows, width))
@@ -265,7 +267,7 @@ class LaneRows(Statistics):
 
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
-    """Simulate a plan, or a single dispersed run of it (`runs`), with the compiled loop."""
+    """Simulate a plan with the compiled loop; `runs` are the values of one dispersed run."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, runs)
     rows = LaneRows(plan.times, loop.width)
     try:
@@ -287,13 +289,14 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
-    `stop` has rates in the order of v. The law has room for noise if it is `noisy`.
+    The squared rates in `stop` are in the order of v. If `noisy`, the law gets memory for noise.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     mechanics = mechanics_of(plant)
-    # Commands that would act only after the end of the run need no space in the delay line.
+    # Limit the delay to the length of the run, because later commands need no space in the delay
+    # line.
     channel = channel_of(plan.limits, u, times.sample, min(times.delay, times.steps))
     return loop.Arguments(
         robot=mechanics,
@@ -313,7 +316,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
         ),
         law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
-        # The loop writes these at its start.
+        # The loop sets these values when it starts.
         reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
@@ -345,7 +348,7 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return a law that gives no commands; it only computes states and errors."""
+    """Return the law of an uncontrolled robot, which computes states and errors but no commands."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -361,7 +364,10 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
 
 
 def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
-    """Return the law of a plan's policy; with an allocation, of the robot `asking`."""
+    """Return the law of a plan's policy.
+
+    With an allocation, it commands the robot of the design.
+    """
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
         asking = Plant(StateMap(plan.policy.design, reference=state.reference, frame=state.frame))
@@ -404,7 +410,7 @@ def _filtered(
     asking: Plant,
     mechanics: forward.Mechanics,
 ) -> policies.Law:
-    """Return the law of a compensator, with one row of its matrices for each sample."""
+    """Return the law of a compensator; along a trajectory, it has matrices for each sample."""
     state, times, rows = asking.state, plan.times, 1
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
@@ -433,7 +439,7 @@ def _filtered(
 
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
-    """Return the allocation of commands for the robot `asking` to inputs of the robot `giving`."""
+    """Return the allocation from the commands of `asking` to the inputs of `giving`."""
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
     point = empty(forward.POINT)._replace(
@@ -451,7 +457,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
 def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
-    """Return a trajectory and its gains; if it ends before the run, with the rest at its end."""
+    """Return a trajectory and its gains; for a longer run, append the gain for its end point."""
     motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]

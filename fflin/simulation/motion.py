@@ -1,4 +1,4 @@
-"""A simulated motion: states, inputs, and the drift of its conserved quantities."""
+"""Motion: states and inputs of a simulation, and the drift of its conserved quantities."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ from fflin.simulation.report import Passed, Saturated, curves, motion_report, pa
 
 FORMATS = (*record.FORMATS, ".csv")
 
-# Largest difference of rates and displacements between the end of a phase and the next phase's
-# start.
+# Largest accepted jump of positions and rates from the end of a phase to the start of the next.
 _MET = 1e-6
 
 
@@ -350,7 +349,7 @@ def require_motion(motion: object) -> Motion:
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Convert rows of another robot to this robot's coordinates; missing joints are at rest."""
+    """Convert rows of `other` to the coordinates of `robot`; missing joints stay at `last`."""
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
@@ -361,7 +360,7 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
 
 
 def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
-    """Append the rows of another motion, converted to this motion's chart, joints and inputs."""
+    """Append the rows of `motion`, converted to the chart, joints and inputs of `whole`."""
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
         where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
         raise InputError(

@@ -35,24 +35,27 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
-# Bounds of an automatic duration [s], and the time step [s] of the linear loop that determines it.
+# Bounds of an automatic duration [s], and the time step [s] of the linear simulation that
+# determines it.
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 _STEP = 0.01  # [s]
-# If inputs jump at knots, the last stage is evaluated earlier by this fraction of a step.
+# If inputs jump at knots, the last stage of a step is evaluated earlier, by this fraction of the
+# step.
 _BEFORE = 1e-6
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-# If the step is chosen automatically, a larger number of steps than the first causes a warning
-# (half a minute of computing). A larger number than the second is refused (some hours).
+# More steps than _MANY_STEPS (half a minute of computing) cause a warning if a fast pole determines
+# the automatic time step. More steps than _ENDLESS (some hours) are refused if `every` is not
+# given.
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
-# With more rows than the first number, only some steps are recorded, in about as many rows as the
-# second.
+# If `every` is not given, at most _MANY_ROWS steps are all recorded. Of more steps, about _FEW_ROWS
+# are recorded.
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000
 _FOREVER = 1e100  # [s]; its inverse squared does not underflow
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulationOptions:
-    """Arguments of `simulate` as they are given; see there for the meaning of each."""
+    """Arguments of `simulate`, unchecked; see `simulate` for their meaning."""
 
     robot: Robot
     policy: object = None
@@ -79,7 +82,7 @@ class SimulationOptions:
 
 
 class Times(NamedTuple):
-    """The step `dt` [s], the number of steps, and sample time, delay and rows in steps."""
+    """Time step `dt` [s] of a simulation, and its other times as numbers of steps."""
 
     dt: float
     steps: int
@@ -96,7 +99,7 @@ class Times(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """Square of the largest angular velocity for which rotations per step are small enough."""
+        """Square of the largest angular velocity at which a step is accurate."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
     @property
@@ -113,7 +116,7 @@ class Times(NamedTuple):
 
 
 class Plan:
-    """Checked plan of `simulate` with some arguments; it does not change during the run."""
+    """Checked arguments of `simulate`, and data derived from them; constant during the run."""
 
     def __init__(self, options: SimulationOptions) -> None:
         robot, policy = options.robot, followed(options.policy, options.robot)
@@ -147,53 +150,57 @@ class Plan:
             if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
-        # `known` are all limits of states and inputs; `limits` are those at which inputs saturate.
+        # `known` contains all limits of states and inputs; `limits` contains those at which inputs
+        # saturate.
         acting, self.known = chosen_limits(robot, options.limits)
         self.limits = saturation(
             robot, acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
-        # Without a law, only `initial` acts: the inputs (nu,) until the first command arrives.
+        # `initial` contains the inputs (nu,) until the first command arrives. Without a law, they
+        # act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
-        # Target state (nx,), if known, or followed motion.
+        # `target` is the target state (nx,) or None. `reference` is the followed motion, as a
+        # function of time, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
-        # State (nx,) from which continuous joints count turns.
+        # State (nx,) that determines the number of full turns of continuous joints in the first
+        # row.
         self.near = self.target
         if options.x0 is not None:
             self.near = np.asarray(options.x0, dtype=float)
         elif self.reference:
             self.near = state.read(*self.reference(0.0)[:2])
-        # In orbit, momentum and centre of mass are not projected.
+        # Momentum and centre of mass are not projected in orbit, where they are not conserved.
         self.project = truth("project", options.project) and robot.orbit is None
-        # Indices in v of the rotation rates of the base and of all joints except rotors: their
-        # rotation within a step is bounded. Nothing depends on the angle of a rotor.
+        # Indices in v of the angular rates whose rotation per step is bounded: base and revolute
+        # joints, but not rotors, because nothing depends on the angle of a rotor.
         rotors, joints = rotor_names(robot), robot.joints
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
         self.steered = fed_back(policy)  # states that are known to be fed back
-        # Measurement noise(t) of the policy, if any.
+        # Function noise(t) of the policy, which returns measurement noise, or None.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
-        # Time of the last stage as a fraction of the step, earlier if inputs jump at knots.
+        # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
 
     def replace(self, **changes: object) -> Plan:
-        """Return the plan with other attributes."""
+        """Return a copy of the plan with some attributes replaced."""
         other = copy(self)
         for name, value in changes.items():
             setattr(other, name, value)
         return other
 
     def channel(self, law: Callable[..., Array], speeds: Callable[..., Array]) -> Channel:
-        """Return the channel of a law's commands to the inputs, without pending commands."""
+        """Return the channel from a law's commands to the inputs; its delay line is empty."""
         times = self.times
         return Channel(law, self.initial, self.limits, times.sample, times.delay, speeds)
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot; return the law, which checks the policy's commands."""
+    """Bind the policy to the robot; return a law that checks the policy's commands."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -201,7 +208,7 @@ def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> La
 
 
 def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
-    """Return the target state (nx,): the given state, or the point of a given model, or None."""
+    """Return the target state (nx,), given as a state, as a model about it, or as None."""
     if target is None:
         return None
     if not isinstance(target, LinearModel):
@@ -209,7 +216,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
     theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
-    # q differs between orbital frames.
+    # In orbit, the model must have the same frame, because the orbital frames have different q.
     if target.moving or not theirs or (state.robot.orbit and target.frame != state.frame):
         raise InputError(
             f"target is a model of '{target.robot}' in frame '{target.frame}', expected a state of "
@@ -222,7 +229,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def _state_of(policy: object, options: SimulationOptions) -> StateMap:
-    """Return the state map of a motion, with the frame and reference of its policy if known."""
+    """Return the state map of a motion; frame and reference are the policy's, if it has any."""
     robot, frame, reference = options.robot, options.frame, options.reference
     own_frame, own_reference = axes_of(policy)
     other_frame = own_frame is not None and frame not in (None, own_frame)
@@ -246,7 +253,7 @@ def _state_of(policy: object, options: SimulationOptions) -> StateMap:
 def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
     """Return the inputs (nu,) before the first command; warn if they exceed the limits."""
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
-    # With allocation, the inputs of the policy's model are not the inputs of the robot.
+    # With an allocation, the policy's model has other inputs than the robot.
     if lin is not None and lin.input_names == actuation.names:
         where, inputs, initial = "at its target", lin.u0[None], lin.u0
     elif along is not None and along is policy:
@@ -260,7 +267,7 @@ def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
 
 
 def times_of(policy: object, options: SimulationOptions) -> Times:
-    """Return the times of a simulation from the options and the policy."""
+    """Derive the times of a simulation from the options and the policy."""
     duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
     follows = tracking_of(policy)
     if sample is not None:
@@ -298,14 +305,14 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         sample = dt if delay else 0.0
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned, part = every is None and steps > _MANY_ROWS, max(samples, 1)
-    # Rows of a sampled loop are at its samples.
+    # If the policy is sampled, record rows only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
     return Times(dt, steps, every, samples, late, fastest, thinned)
 
 
 def _require_room(times: Times, state: StateMap, *, chosen: bool) -> None:
-    """Raise an error for too many rows or steps; warn of many automatically `chosen` steps."""
+    """Raise an error for too many rows or steps; warn if a `chosen` automatic step is small."""
     dt, steps, rows, fastest = times.dt, times.steps, times.rows, times.fastest
     width = state.robot.nq + state.robot.nv + 2 * state.nx
     if rows * width > _MOST_ENTRIES or steps > (_ENDLESS if times.thinned else _MOST_STEPS):
@@ -334,7 +341,7 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 
 
 def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a step that divides the sample time and, if possible, the other times."""
+    """Return a time step that divides the sample time and, if possible, all other times."""
     least = int(np.ceil(sample / largest))
     for parts in range(least, least + 1000):
         dt = sample / parts
@@ -351,9 +358,10 @@ def _positive(name: str, value: object) -> float:
 
 
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
-    """Return the time [s] at which the errors of the linear loop stay below 1 % of their maxima.
+    """Return the time [s] after which the linear loop's errors stay below 1 % of their maxima.
 
-    The time is rounded up to tens of seconds.
+    The time is rounded up to tens of seconds and is at least SHORTEST. If the loop does not settle
+    before LONGEST, return SHORTEST.
     """
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)

@@ -1,4 +1,4 @@
-"""Charts of a motion, and its figure: states, inputs, errors and drifts."""
+"""Charts and figure of a motion: states, inputs, errors and drifts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.report import STATES, Curve, curves
 
 _MOST_IN_A_PANEL, _ACROSS = 6, 3
-# Titles of charts by the group and the unit of their curves, in the order of the charts.
+# {(group, unit) of curves: title of their chart}, in the order of the charts.
 _TITLES = {
     ("q_b", "1"): "attitude",
     ("r_b", "m"): "position",
@@ -39,12 +39,15 @@ _TITLES = {
 }
 JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
-# A target that moves less than this between rows, in SI units, is at rest.
+# A target counts as at rest if it moves less than this [SI] between two rows.
 _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target is at rest, or None; None with phases."""
+    """Return the time [s] from which a moving target rests.
+
+    Return None if the target never moves, does not come to rest, or if the motion has phases.
+    """
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if motion.phases or not len(moved) or moved[-1] + 2 >= len(places):
@@ -146,7 +149,7 @@ def plot_motion(
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
-    """Return the chosen curves of each chart by its title; the curves of a chart have one unit."""
+    """Return {title of a chart: its curves} for the chosen signals; a chart has only one unit."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
@@ -161,7 +164,7 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
-    """Return the errors from a reference (attitude in degrees), or else from the linear model."""
+    """Return the errors from the reference, or else the differences from the linear prediction."""
     names, units, what = motion.state_names, motion.state_units, "error"
     if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
@@ -182,7 +185,7 @@ def _draw(
     colors: Mapping[str, str],
     width: float | None = None,
 ) -> None:
-    """Draw curves, their references (pale), predictions (dashed) and limits."""
+    """Draw curves and their limits; references are pale, and predictions dashed."""
     group, unit = found[0].group, found[0].unit
     if group == "q_b":
         found = _with_gaps(found)
@@ -202,7 +205,7 @@ def _draw(
 
 
 def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
-    """Return attitudes with gaps at 180 degrees, where the quaternion changes its sign."""
+    """Insert gaps into attitude curves at 180 degrees, where the quaternion changes its sign."""
     broken = list(found)
     for field in ("values", "linear", "reference"):
         if getattr(found[0], field) is not None:
@@ -225,7 +228,8 @@ def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> 
 
 
 def _draw_drifts(axes: Axes, motion: Motion) -> None:
-    # A logarithmic axis has no zero, so smaller drifts are raised to the machine epsilon.
+    # A logarithmic axis has no zero, so smaller drifts are raised to a tenth of the machine
+    # epsilon.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):

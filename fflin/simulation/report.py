@@ -1,4 +1,4 @@
-"""Report of a motion: settling, inputs, limit violations, and conserved quantities."""
+"""Report of a motion: settling, inputs, limit violations and conserved quantities."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from fflin.dynamics.impact import Impact
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# An error has settled when it stays below this fraction of its largest value.
+# An error has settled once it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# If an error [SI units] never exceeds THERE, the motion is at the target throughout. An error
-# below _NOTHING is not shown. Rounding errors move a robot at rest by less than both limits.
+# An error [SI units] that never exceeds THERE means that the robot is at its target throughout. A
+# value below _NOTHING is shown as zero. Rounding errors of a robot at rest are smaller than both
+# values.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# Fraction of the rows at the end of a run in which a settled error must remain small.
+# A settled error must stay small at least over this last fraction of the rows of a run.
 DWELL = 0.05
 
-# Smallest reported violation, relative to the limit; a smaller one may be an integration error.
+# Smallest violation that is reported, relative to the limit. Smaller ones may be integration
+# errors.
 _SHARE = 1e-3
 
 _MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
@@ -40,21 +42,20 @@ _OF_PHASES = (
 STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 _TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
-# Errors of flexible appendages and liquids, which do not count as settling.
+# {group: titles} of the errors of flexible appendages and liquids, which the verdict ignores.
 _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
 _ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
 _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 
-# Rotation [deg] up to which a modal amplitude is accurate, because the model is linear in the
-# amplitude.
+# Rotation [deg] above which modal amplitudes are inaccurate, because the modal model is linear.
 _LINEAR = 5.0
 
-# A limit is drawn if the curve reaches this fraction of the limit.
+# A limit is drawn if the curve reaches at least this fraction of it.
 _NEAR = 1.0 / 3.0
 
 
 class Curve(NamedTuple):
-    """Values (N,) of a state or input, limits (2,), and any prediction and reference (N,)."""
+    """Values (N,) of a state or input, with its limits, and its prediction and reference if any."""
 
     key: str  # GROUP.NAME
     group: str  # "speed" and "momentum" of wheels
@@ -67,7 +68,7 @@ class Curve(NamedTuple):
 
     @property
     def short(self) -> str:
-        """Name without its group."""
+        """Name of the signal without its group."""
         return self.key.partition(".")[2]
 
     @property
@@ -77,12 +78,12 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits that the values come close to."""
+        """Limits of which the values reach at least the fraction _NEAR."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 
 def curves(motion: Motion) -> Iterator[Curve]:
-    """Yield curves of states, inputs, and speed and momentum of wheels."""
+    """Yield a curve for each state, each input, and the speed and the momentum of each wheel."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
     unlimited = np.full(2, np.inf)
@@ -104,7 +105,7 @@ def curves(motion: Motion) -> Iterator[Curve]:
 
 
 class Passed(NamedTuple):
-    """Limit violation: the value [unit] farthest beyond the limit, its time [s], and the limit."""
+    """Limit violation: the value that is farthest beyond the limit, its time, and the limit."""
 
     name: str
     value: float
@@ -120,7 +121,7 @@ class Passed(NamedTuple):
 
 
 class Saturated(NamedTuple):
-    """Saturation of an input or wheel speed: its limit [unit] and the fraction of the run."""
+    """Saturation of an input or wheel speed: the limit, and the fraction of time at the limit."""
 
     name: str
     limit: float
@@ -133,7 +134,7 @@ class Saturated(NamedTuple):
 
 
 def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
-    """Return the limit violations, with the largest relative violation first."""
+    """Return the limit violations, largest relative violation first."""
     worst = []
     for curve in found:
         if curve.group == "momentum" or not curve.levels:
@@ -150,10 +151,11 @@ def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
 
 
 def saturated(t: Array, found: Iterable[Curve]) -> tuple[Saturated, ...]:
-    """Return inputs and wheel speeds at a nonzero limit, with the longest saturation first."""
+    """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first."""
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
     for curve in found:
-        # A wheel speed only approaches its limit, but an input is clipped exactly at its limit.
+        # Use a larger margin for wheel speeds: they only approach their limit, but inputs are
+        # clipped exactly at theirs.
         margin = 1e-3 if curve.group == "speed" else 1e-9
         enforced = curve.group not in (*STATES, "momentum")
         for limit in curve.levels if enforced else ():
@@ -178,22 +180,22 @@ def _shown(value: float) -> str:
 
 
 def settled_at(sizes: Array) -> Indices:
-    """Return the row from which each error (N, ..) has settled; N if an error has not settled."""
+    """Return the row at which each error (N, ..) has settled, or N if it has not settled."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
 
 
 def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
-    """Return whether errors settle too late in a run of `count` rows to count as settled.
+    """Return whether errors settle too close to the end of a run of `count` rows.
 
-    An error that merely passes through zero at the end therefore does not count as settled.
+    Such errors count as not settled, because they may only pass through zero at the end.
     """
     return settled > (1.0 - DWELL) * count
 
 
 class ErrorSize(NamedTuple):
-    """Size of one kind of error at the start, at most and at the end of a motion."""
+    """Initial, largest and final size of one kind of error in a motion."""
 
     title: str
     unit: str
@@ -205,12 +207,12 @@ class ErrorSize(NamedTuple):
 
     @property
     def last(self) -> str:
-        """Title, final value and unit, for a sentence."""
+        """Title, final value and unit of this error as text."""
         return f"{self.title}\u00a0{self.final:.2g}\u00a0{self.unit}"
 
     @property
     def row(self) -> list[str]:
-        """Row of this error in the table."""
+        """Cells of the table for this error."""
         when = "not yet" if self.steered else "not controlled"
         if self.settled is not None:
             when = f"{self.settled:.3g}" if self.largest > THERE else "."
@@ -222,9 +224,10 @@ def _cells(*values: float) -> list[str]:
 
 
 def error_sizes(motion: Motion) -> list[ErrorSize]:
-    """Return the errors of each kind, or an empty list without a target.
+    """Return the sizes of each kind of error, or an empty list if the motion has no target.
 
-    Wheel speeds and modes have their own kinds. Wheel angles are left out.
+    Wheel speeds and modes are separate kinds. Wheel angles are excluded, because nothing depends on
+    them.
     """
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -251,12 +254,12 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
 
 
 def pushed(of: object) -> bool:
-    """Return whether an input of a motion or similar object is a force on the base."""
+    """Return whether a motion or similar object has inputs that exert a force on the base."""
     return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
 def motion_report(motion: Motion) -> str:
-    """Return the report of a motion: settling, inputs, violations, and conserved quantities."""
+    """Return a text about settling, inputs, limit violations and conserved quantities."""
     kinds, t = error_sizes(motion), motion.t
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
@@ -302,7 +305,7 @@ def motion_report(motion: Motion) -> str:
 
 
 def motion_record(motion: Motion) -> dict[str, object]:
-    """Return the numbers of the report by name."""
+    """Return the values of the report as {name: value}, for --json."""
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     return {
@@ -319,14 +322,15 @@ def motion_record(motion: Motion) -> dict[str, object]:
 
 
 def _phases(motion: Motion) -> list[list[str]]:
-    """Return the table of phases; for a motion from a file, the table lacks the impacts."""
+    """Return the table of phases; without impacts if the motion was read from a file."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
     parts = motion._phases or motion.phases
     pairs = zip((None, *parts), parts, strict=False)
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        # Each line with its row, and the energy and momentum that are not of this row.
+        # Each line has a label, a row of the motion, and the energy and momentum that are added to
+        # those of the row. Before an impact, these are the amounts that the impact removes.
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)
@@ -341,7 +345,7 @@ def _phases(motion: Motion) -> list[list[str]]:
 
 
 def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
-    """Return one line: whether a motion settled at its target, and if not, why."""
+    """Return one line that says whether the motion settled, or which errors did not."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -378,7 +382,7 @@ def _and(words: list[str]) -> str:
 
 
 def _largest_modes(motion: Motion) -> str:
-    """Return the largest amplitude of each mode, and the corresponding rotation."""
+    """Return a table with the largest amplitude of each mode, and the corresponding rotation."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):

@@ -1,7 +1,7 @@
-"""The engine in Python: accelerations, conserved quantities, and the loop over a plan.
+"""The Python engine: accelerations, conserved quantities, and the simulation loop.
 
-Without external forces the momentum about a fixed point is constant, and the centre of mass moves
-along r_c(t) = r_c(0) + p t / m. In orbit the Jacobi integral (14.3) is conserved instead.
+Without external forces, the momentum about a fixed point is constant, and the centre of mass moves
+along r_c(t) = r_c(0) + p t / m. In orbit, the Jacobi integral (14.3) is constant instead.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from fflin.robot.mass_properties import require_inertia
 if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
 
-# Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force and
-# torque on the base in base axes, then joint forces.
+# Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force on the
+# base, torque on the base, joint forces. Force and torque are in base axes.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Velocity above which a disturbance need not be finite, because the motion has diverged.
+# Above this velocity, the motion has diverged, and a disturbance that is not finite is no error.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -49,7 +49,7 @@ _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
 
 class Plant(Aba):
-    """The nonlinear robot under inputs (in the axes of the state's frame) and a disturbance."""
+    """The nonlinear robot with inputs, in the axes of the state's frame, and a disturbance."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         nu, groups = len(self.actuation.names), self.actuation.groups
-        # Index of the first of the three inputs of each vector on the base.
+        # Indices of the first components of the base torque and the base force, if they are inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
@@ -72,15 +72,15 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         self._columns = state.lift(self.actuation.fixed)
-        # Whether only u acts on the robot, with a constant input matrix.
+        # Whether the inputs are the only forces, and their matrix is constant.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,), and the external wrench (6,) without gravity, in base axes.
+        """Return dv/dt (nv,) and, in base axes, the external wrench (6,) without gravity.
 
-        In orbit, the wrench is replaced by the power [W] of inputs, disturbance and dampers,
-        followed by zeros.
+        In orbit, return [power, 0, 0, 0, 0, 0] instead of the wrench. The power [W] is the sum over
+        inputs, disturbance and dampers.
         """
         if self._faulty:
             given = np.empty(len(u))
@@ -110,7 +110,7 @@ class Plant(Aba):
         return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
-        """Return whether no external force acts; if `driven`, wrenches of inputs count too."""
+        """Return whether no external force acts; `driven` includes the wrenches of inputs."""
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
@@ -118,18 +118,19 @@ class Plant(Aba):
 
 
 class Conserved:
-    """Momentum (linear, then angular about a fixed point, in world axes), and centre of mass.
+    """Prediction of the momentum and the centre of mass from the external impulse.
 
-    Both follow from the initial state and the external impulse, step by step (11.2). In orbit, the
-    Jacobi integral, its first entry, takes the place of the momentum, and the work that of the
-    impulse.
+    The momentum (6,) is the linear momentum, then the angular momentum about a fixed point, in
+    world axes. Momentum and centre of mass are advanced step by step from the initial state (11.2).
+    In orbit, the first entry of the momentum is the Jacobi integral, and the work of the forces
+    replaces the impulse.
     """
 
     momentum: Array  # (6,) after the steps so far
     wrenches: tuple[Array, ...]  # (6,) about the point for each stage; the caller writes them
 
-    # The fixed point is the initial position of the base. About the world's origin, digits would be
-    # lost if the robot were far away from it.
+    # The fixed point is the initial position of the base. The world's origin would cause large
+    # rounding errors if the robot were far away from it.
 
     def __init__(self, plan: Plan) -> None:
         robot, start = plan.plant.robot, plan.q[:3]
@@ -146,11 +147,11 @@ class Conserved:
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
-        # Position and velocity of the centre of mass without external forces, as columns.
+        # Columns: position and velocity of the centre of mass if no external forces act.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # Rows: the impulse; the displacement that the impulse causes; the wrenches of a step.
-        # Without external forces all rows are exactly zero.
+        # Rows: the impulse, the displacement that it causes, and the wrenches at the stages of a
+        # step. If no external forces act, all rows are exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
@@ -158,7 +159,7 @@ class Conserved:
         self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the wrench (6,) of a plant's push and gravity about the point, in world axes."""
+        """Return the sum (6,) of a wrench in base axes and the weight, converted to world axes."""
         if self._field:
             return push
         base = _placement(q[:7] - self._start)
@@ -172,20 +173,20 @@ class Conserved:
         return total
 
     def advance(self) -> None:
-        """Advance by a step under the wrenches that were written for its stages."""
+        """Advance by one step with the `wrenches` at its stages."""
         self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
         self._line[:, 0] = self._center + displacement[:3]
 
     def center(self, t: float) -> Array:
-        """Return the centre of mass (3,) relative to the point."""
+        """Return the centre of mass (3,) at time t, relative to the fixed point."""
         self._time[1] = t
         return self._line.dot(self._time)
 
     def impose(self, t: float, q: Array, v: Array) -> None:
-        """Set the base's position in `q` and velocity in `v` by centre of mass and momentum."""
-        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Only the deviation of the
-        # momentum is solved for, so rounding errors are relative to this small correction. M is in
+        """Correct the base position in `q` and base velocity in `v` to the predicted values."""
+        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Only the correction of nu_b
+        # is computed, from the error of the momentum, so its rounding errors are small. M is in
         # base axes, so it does not depend on the base's position.
         momentum = self.momentum
         _crba(self._model, self._data, q)
@@ -207,11 +208,12 @@ class Conserved:
         v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
     def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return the conserved quantities at each row of q (N, nq) and v (N, nv).
+        """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
 
-        They are energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
-        momentum about the point (N, 6), and bounds (2,) of its linear and its angular part (11.5).
-        In orbit, the Jacobi integral and zeros take the place of the momentum about the point.
+        In this order: energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
+        momentum about the fixed point (N, 6), and bounds (2,) of the linear and of the angular
+        momentum (11.5). In orbit, the Jacobi integral, followed by zeros, replaces the momentum
+        about the fixed point.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
@@ -221,7 +223,8 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             pin.ccrba(model, data, q_i, v_i)
-            # The momentum of CCRBA is summed about the origin and has larger rounding errors.
+            # CCRBA sums the momentum about the origin, with larger rounding errors than this
+            # function.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
@@ -248,7 +251,7 @@ class Conserved:
         return energy, momentum, center, kept, scale
 
     def _of_wheels(self) -> Array:
-        """Return the stored momentum (3,) at the last evaluated link poses, in world axes."""
+        """Return the stored momentum (3,) in world axes, for the link poses in `_data`."""
         total: Array = np.zeros(3)
         for joint, stored in self._stored:
             total += self._data.oMi[joint].rotation @ stored
@@ -256,7 +259,7 @@ class Conserved:
 
 
 class Recording(NamedTuple):
-    """Recorded rows of a run: times (N,), motion, inputs and conserved quantities."""
+    """Recorded rows of a run: times, configurations, velocities, inputs and predicted momentum."""
 
     t: Array
     q: Array
@@ -269,7 +272,7 @@ class Recording(NamedTuple):
     engine: str  # name of the engine
 
 
-# A diverging motion overflows before it is stopped, so NumPy need not warn.
+# A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
     """Simulate a plan in Python; the progress bar of a long run shows `hint`."""
@@ -291,7 +294,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
         nonlocal stages
-        # At the first stage, u is already the policy's command.
+        # At the first stage, `u` is already the policy's command; at later stages, ask the policy.
         a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
         if pushed:
             kept.wrenches[stages][:] = wrench(q, push)
@@ -331,18 +334,18 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
-    """Return the stop conditions of a run, with squared rates in the order of v (nv,)."""
+    """Return the stop conditions of a run; limits (nv,) of squared rates are in v's order."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = plan.times.slow
-    # With a model, the run ends when the base leaves the chart of the state.
+    # If the policy has a linear model, the run ends when the base leaves the attitude chart.
     charted = feedback_of(plan.policy)[0] is not None
     sign = float(np.sign(plan.plant.state.scalar(plan.q))) if charted else 0.0
     return StopConditions(squares=squares, sign=[sign])
 
 
 def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
-    """Build a function that returns why a run ends, or an empty text if the run continues."""
-    # The entries of a list are read faster than the entries of an array.
+    """Return a function that returns why the run ends, or an empty text if it continues."""
+    # Use lists, because reading an entry of a list is faster than reading an entry of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])
     origin = [0.0, 0.0, 0.0, *plan.plant.state.origin_quaternion.tolist()]
@@ -374,6 +377,6 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
 
 
 def stop_of(message: str) -> int:
-    """Return the index in STOPS for the message with which a run ended."""
+    """Return the index in STOPS of the message with which a run ended."""
     found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
     return next(found, len(STOPS) - 1) if message else 0

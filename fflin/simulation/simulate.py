@@ -1,4 +1,4 @@
-"""Simulation of the nonlinear robot on the manifold, under any policy, with a linear prediction."""
+"""Simulation of the nonlinear robot under any policy, with a linear prediction."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
 
-# Linear model that predicts a motion, and the command (nu,) for a deviation (nx,) from its point.
-# In the deviation, the robot's states come first, then those of a continuous-time controller.
+# Linear model that predicts a motion, and the function from a deviation to the command (nu,). The
+# deviation from the operating point consists of the robot's states, followed by the states of a
+# continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
-# compiled loop takes about _FRACTION of the time. Compiling it takes about _COMPILING seconds,
-# once.
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. A run
+# then takes about the fraction _FRACTION of the time. Compiling takes about _COMPILING seconds, but
+# only once.
 _FRACTION, _COMPILING = 0.1, 30.0
 
 _log = logging.getLogger("fflin")
@@ -217,7 +218,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
-    """Return the motion of a run of a plan, with a prediction if a predictor is given."""
+    """Build the motion from the recorded rows of a run; `foresees` adds a linear prediction."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -238,7 +239,8 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         energy=energy,
         momentum=np.roll(momentum, 3, axis=1),
         momentum_drift=drift.max(axis=1),
-        # In orbit, the centre of mass does not move along a straight line even without forces.
+        # In orbit there is no com_drift, because the centre of mass moves on a curve even without
+        # other forces.
         com_drift=np.linalg.norm(center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
@@ -262,7 +264,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
 
 
 def predictor(plan: Plan) -> Predictor | None:
-    """Return the predictor of a plan's motion: of the policy's own model, or the given model."""
+    """Return the predictor of a plan's motion, by the given model or else the policy's own."""
     linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
     own, _ = feedback_of(policy)
     lin = own
@@ -311,7 +313,7 @@ def predictor(plan: Plan) -> Predictor | None:
     )
 
 
-# After an overflow the prediction is omitted, so NumPy need not warn.
+# A prediction that overflows is omitted, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     """Return the states (N, nx) that the linear closed loop predicts; no rows if it cannot."""

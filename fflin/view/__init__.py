@@ -1,4 +1,4 @@
-"""Views of robots, motions and modes in meshcat: an HTML page, pictures, or a live page.
+"""Views of robots, motions and modes in meshcat, as an HTML file, pictures, or a live page.
 
 The JavaScript of the pages is in `view/assets`.
 

@@ -1,4 +1,4 @@
-"""Pictures of a page, taken by an installed Chromium."""
+"""Pictures of an HTML page, taken by an installed Chromium."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NAMES = (
     *("microsoft-edge", "msedge"),
 )
 
-# Options for WebGL without a graphics card, and without network access.
+# Options for WebGL without a graphics card, and for no background network access.
 _ARGUMENTS = (
     *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
@@ -33,7 +33,7 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It ends when
+# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It exits when
 # they are closed, so it never outlives this process.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
@@ -44,7 +44,7 @@ _GIF_FRAMES = 96
 
 
 def find_chromium() -> str:
-    """Return the path of a Chromium, or raise `MissingPackageError`."""
+    """Return the path of an installed Chromium, or raise `MissingPackageError`."""
     found = next(filter(None, map(shutil.which, _NAMES)), None)
     if found is None:
         raise MissingPackageError(
@@ -55,7 +55,7 @@ def find_chromium() -> str:
 
 
 def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes:
-    """Return a PNG of a motion's page at one time [s], or a strip of pictures at several times."""
+    """Return a PNG of a motion's page at one time [s], or a strip of several pictures."""
     frames = _film(page, times, size, 1 if len(times) > 1 else -1)
     if len(frames) == 1:
         return frames[0]
@@ -70,7 +70,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
 
 
 def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
-    """Return a GIF of a motion's page over a span [s]; long spans are shown faster."""
+    """Return a GIF of a motion's page over a time span [s]; long spans are shown faster."""
     from PIL import Image
 
     start, duration = span[0], span[1] - span[0]
@@ -90,7 +90,7 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
 def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
     """Return a PNG of the page at each time.
 
-    Pictures show only the scene, and the first `keys` pictures also a legend. If `keys` is
+    The pictures show only the scene; the first `keys` of them also show a legend. If `keys` is
     negative, all pictures show the whole page.
     """
     program = find_chromium()
@@ -105,8 +105,8 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
             for index, moment in enumerate(times):
                 if keys >= 0:
                     browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
-                # Wait for two animation frames: the first draws the scene, the second follows its
-                # display.
+                # Wait for two animation frames: the first draws the scene, and the second starts
+                # after the drawing is displayed.
                 browser.evaluate(
                     f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() "
                     "=> requestAnimationFrame(() => done(1))))"
@@ -120,7 +120,7 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
 
 @contextmanager
 def _browser(program: str, patience: float) -> Iterator[_Browser]:
-    """Run a browser for a limited time, and remove its temporary files."""
+    """Run a browser for at most `patience` seconds, and then remove its temporary files."""
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
@@ -130,9 +130,9 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # The browser's temporary files are removed with the folder. The folder's name is
-            # short, because the path of the browser's socket may have only about a hundred
-            # characters.
+            # The browser writes its temporary files into this folder, which is removed at the end.
+            # A folder with a long name is not used, because the path of a socket in it is limited
+            # to about 100 characters.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
@@ -144,7 +144,8 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
                 browser = _Browser(process)
                 yield browser
                 with suppress(_BrowserError, subprocess.TimeoutExpired):
-                    # Unlike a killed browser, a closed one removes its temporary files.
+                    # Close the browser before killing it, because only a closed browser removes its
+                    # temporary files.
                     browser.session = {}
                     browser.tell("Browser.close")
                     process.wait(5.0)
@@ -160,7 +161,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 class _BrowserError(Exception):
-    """Error that the browser reports for a command."""
+    """Error that the browser returns for a command."""
 
 
 class _Browser:
@@ -171,7 +172,7 @@ class _Browser:
         self._commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
-        # All further commands are sent to one tab, unless this is empty.
+        # Tab to which commands are sent; if empty, they are sent to the browser.
         self.session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
@@ -198,7 +199,7 @@ class _Browser:
         return result
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript, or of its promise."""
+        """Return the value of a JavaScript expression; if it is a promise, wait for its result."""
         answer = self.tell(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )

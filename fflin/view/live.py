@@ -1,4 +1,4 @@
-"""Live viewer: a page on the loopback address, served by a thread of this process."""
+"""Live viewer: a page that a thread of this process serves to this machine only."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from fflin.view.page import Page, body_poses, subtitle
 
 _HOST = "127.0.0.1"
 
-# Request of a browser: {"joints": {name: value}}, or a true value of "neutral" or "random".
+# Request of a browser: {"joints": {name: value}}, {"neutral": true} or {"random": true}.
 Request: TypeAlias = "Mapping[str, Mapping[str, float]]"
 
 
 class Live:
-    """Live view of a robot in a browser; made by `visualize(robot)`.
+    """Live view of a robot in a browser; `visualize(robot)` returns it.
 
-    A thread of this process serves the page, to this machine only, until the process ends. Given to
-    `simulate` as its callback, the viewer shows the running simulation.
+    A thread of this process serves the page, to this machine only, until the process ends. If the
+    viewer is given to `simulate` as its callback, it shows the running simulation.
 
     Attributes
     ----------
@@ -45,9 +45,9 @@ class Live:
     q : ndarray (nq,)
         Current configuration of the robot; the sliders change it.
     meshcat : meshcat.Visualizer
-        Viewer for additional objects.
+        meshcat viewer, to which further objects can be added.
     notes : tuple of str
-        Remarks on visual elements that could not be drawn.
+        Notes about visual elements that could not be drawn.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Live:
         self.robot, self._speed = robot, speed
         self._state_map, self._ranges = StateMap(robot), _ranges(robot)
         self._lock = threading.Lock()
-        # Clock time and simulation time [s] at the beginning of the shown simulation.
+        # Clock time and simulation time [s] at the first shown step of a simulation.
         self._began: tuple[float, float] | None = None
         self._running, self._state, self._clients = False, "{}", set[_Socket]()
         self._page, page.window.forward = page, self._send
@@ -92,7 +92,7 @@ class Live:
         self.show(q)
 
     def _serve(self, listener: socket.socket) -> threading.Thread:
-        """Start the thread that serves the page until the viewer is closed."""
+        """Start a thread that serves the page until the viewer is closed."""
         given = {"live": self}
         application = Application(
             [("/", _Page, given), ("/socket", _Socket, given)],
@@ -121,7 +121,7 @@ class Live:
         return thread
 
     def show(self, q: Array, t: float | None = None) -> None:
-        """Show the robot at a valid configuration (nq,), and the time t [s]."""
+        """Show the robot at a configuration (nq,), and the time t [s]."""
         q = self.robot.checked_configuration(q).copy()
         q.setflags(write=False)
         with self._lock:
@@ -135,11 +135,11 @@ class Live:
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
             self.q, self._state = q, json.dumps(state)
-        # Slow browsers skip states that are out of date.
+        # A slow browser skips states for which there is a newer one.
         self._each(_Socket.update)
 
     def __call__(self, t: float, q: Array, *_: object) -> None:
-        """Show a step of a running simulation, delayed to the playback speed."""
+        """Show a step of a running simulation; wait first, to keep the playback speed."""
         now = monotonic()
         if self._began is None or t <= self._began[1]:
             self._began = now, t
@@ -215,7 +215,7 @@ def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
 
 
 class _Guarded(RequestHandler):
-    """Handler that accepts only this machine's names as host, and so refuses other sites' pages."""
+    """Handler that refuses requests from other sites: the host must be this machine."""
 
     def initialize(self, live: Live) -> None:
         self._live = live
@@ -235,7 +235,7 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser, which gets the newest state after the previous has arrived."""
+    """Connection to one browser. The next state is sent when the previous has arrived."""
 
     _busy = False
     _behind = False
@@ -253,7 +253,7 @@ class _Socket(_Guarded, WebSocketHandler):
         self._live._clients.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
-        # Invalid messages are ignored, and too deeply nested messages close the connection.
+        # Ignore invalid messages. A message that is nested too deeply closes the connection.
         try:
             self._live._asked(json.loads(message))
         except (FflinError, ValueError, TypeError, AttributeError, ArithmeticError):

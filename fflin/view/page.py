@@ -1,7 +1,7 @@
-"""Robots as nodes of a meshcat scene, and the self-contained HTML page of a scene.
+"""Drawing of robots in a meshcat scene, and the self-contained HTML page of the scene.
 
-Each body has a node, with its visual elements below. Wheels and thrusters are drawn at their places
-on the links.
+Each body has a node, whose child nodes are its visual elements. Wheels and thrusters are drawn at
+their positions on the links.
 """
 
 from __future__ import annotations
@@ -39,16 +39,17 @@ with warnings.catch_warnings():
 
 Lowered = dict[str, Any]
 
-# Wheels at the same point are drawn apart along their axes, at this distance in robot sizes.
+# Wheels in the same frame would overlap. Each is moved along its axis by this distance, relative to
+# the robot's size.
 _APART = 0.1
 
-# Cylinders are along y in three.js, and along z in URDF.
+# The axis of a cylinder is y in three.js, and z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
-# Extension types of msgpack-lite, which the page decodes as typed arrays.
+# {type of an array: its extension type of msgpack-lite, and the typed array that the page decodes}.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
-# Placeholder for a mesh that the page already has.
+# Placeholder for a mesh that has already been sent to the page.
 _ELSEWHERE: dict[str, object] = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 _SCRIPTS = (
@@ -72,7 +73,7 @@ def _asset(name: str) -> str:
 
 @cache
 def _fixed() -> dict[str, str]:
-    """Return the parts of a page that are the same for all pages: its style and its scripts."""
+    """Return the parts that all pages share: the style and the scripts."""
     bundle = files("meshcat").joinpath("viewer", "dist", "main.min.js")
     meshcat = bundle.read_text(encoding="utf-8")
     body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
@@ -81,15 +82,17 @@ def _fixed() -> dict[str, str]:
     return {
         "style": _asset("style.css"),
         "meshcat": meshcat.replace("</script", "<\\/script").replace("<!--", "<\\!--"),
-        # A function scope separates the names in these scripts from the names in meshcat's bundle.
+        # Put the scripts into a function, so that their names do not collide with names in
+        # meshcat's bundle.
         "scripts": f"(() => {{\n{head}\n{body}\nmain();\n}})();",
     }
 
 
 def body_poses(robot: Robot, q: Array) -> Array:
-    """Return the poses (.., njoints - 1, 7) of all joint frames at q (.., nq).
+    """Return the poses (.., njoints - 1, 7) of all bodies at q (.., nq).
 
-    The first mode of a flexible appendage has the pose of the appendage's bent frame.
+    A body has the pose of its joint frame. The first mode of a flexible appendage has the pose of
+    the appendage's bent frame instead.
     """
     data, found = robot.model.createData(), []
     for row in q.reshape(-1, robot.nq):
@@ -102,7 +105,7 @@ def body_poses(robot: Robot, q: Array) -> Array:
 
 
 class Drawing:
-    """Drawing of a robot below a node of a meshcat scene, with a child node for each joint."""
+    """Drawing of a robot below a node of a meshcat scene, with a child node for each body."""
 
     def __init__(
         self,
@@ -114,7 +117,7 @@ class Drawing:
     ) -> None:
         self.robot, self.prefix = robot, prefix
         self._visualizer = visualizer
-        # Node name of each body, in the order of Pinocchio's joints from 1 on.
+        # Name of each body's node, in the order of Pinocchio's joints (without the universe).
         self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
         sent = set() if sent is None else sent  # meshes that were sent to the page, updated below
         found, self.notes = shapes(robot)  # shapes, and notes about missing drawings
@@ -133,7 +136,8 @@ class Drawing:
                     about["mesh"] = identity
                     sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
-                # A three.js mesh; the page has its material and known geometry.
+                # A three.js mesh. The page replaces the placeholders by its own material and
+                # meshes.
                 content = {
                     "metadata": {"version": 4.5, "type": "Object"},
                     "geometries": [shown],
@@ -155,13 +159,13 @@ class Drawing:
         ]
 
     def place(self, poses: Array) -> None:
-        """Set the poses of all bodies: (njoints - 1, 7) with x, y, z and quaternion x, y, z, w."""
+        """Set the poses (njoints - 1, 7) of all bodies: position, then quaternion x, y, z, w."""
         for path, pose in zip(self.paths, poses, strict=True):
             matrix = pin.XYZQUATToSE3(pose).homogeneous.T.ravel().tolist()
             self._send("set_transform", self._visualizer[path], matrix=matrix)
 
     def points(self, poses: Array) -> Array:
-        """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
+        """Return the corners (M, 3) of all bounding boxes in the world."""
         found = []
         for joint, corners in zip(self.bodies, self.corners, strict=True):
             placement = pin.XYZQUATToSE3(poses[joint - ROOT])
@@ -172,7 +176,7 @@ class Drawing:
         node.window.record({"type": kind, "path": node.path.lower(), **entries})
 
     def tracks(self, t: Array, poses: Array) -> list[dict[str, object]]:
-        """Return the animation of all bodies by times t (N,) and poses (N, njoints - 1, 7)."""
+        """Return the animation of all bodies, given times t (N,) and poses (N, njoints - 1, 7)."""
         times = typed(t)
         clips = []
         for index, path in enumerate(self.paths):
@@ -186,7 +190,7 @@ class Drawing:
 
 
 def _link(robot: Robot, shape: Shape) -> list[float]:
-    """Return the mass [kg] of a shape's link, and its pose (7,) in the joint's frame."""
+    """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
     model, pieces = robot.model, robot.pieces
     if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body drawn as a box of its inertia
         mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
@@ -205,7 +209,7 @@ def typed(array: Array | Indices, kind: str = "<f4") -> object:
 
 
 def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]:
-    """Return geometry, matrix, colour, and two corners of the bounding box of each piece."""
+    """Return the geometry, matrix, colour, and opposite corners of the box of each piece."""
     unit = np.eye(4)
     if shape.kind == "mesh":
         assert shape.mesh is not None
@@ -257,19 +261,20 @@ def _bounds(points: Array) -> Array:
 
 
 def _box_corners(matrix: Array, box: Array) -> Array:
-    """Return the corners (8, 3) of a box (2, 3) that is transformed by a matrix (4, 4)."""
+    """Return the corners (8, 3) of a box, given by two corners (2, 3), after a transform (4, 4)."""
     choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
     corners = np.take_along_axis(box, choice, axis=0)
     return corners @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 class Recorder:
-    """Window for a meshcat.Visualizer that records the scene and forwards each command."""
+    """Replacement for the window of a `meshcat.Visualizer`: records and forwards its commands."""
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
         self.forward = forward
-        # {path: {"set_object": ..., "set_transform": ..., "set_property visible": ...}}
+        # Last command of each kind for each node: {path: {"set_object": command, "set_property
+        # visible": command, ...}}.
         self._nodes: dict[str, dict[str, Lowered]] = {}
         self._animation: Lowered | None = None
 
@@ -278,7 +283,7 @@ class Recorder:
         self.record(command.lower())
 
     def record(self, lowered: Lowered) -> None:
-        """Record and forward a command in the form that is sent."""
+        """Record and forward a command in the form in which meshcat sends it."""
         kind, path = lowered["type"], lowered.get("path", "")
         # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
@@ -297,17 +302,17 @@ class Recorder:
     def commands(self) -> Iterator[bytes]:
         """Yield the messages with which meshcat's page builds the recorded scene."""
         for node in list(self._nodes.values()):
-            # An object replaces the previous object, so it comes before its properties.
+            # Setting an object resets its properties, so it is sent before them.
             for key in sorted(node, key=lambda key: key != "set_object "):
                 yield umsgpack.packb(node[key])
         if self._animation:
             yield umsgpack.packb(self._animation)
 
     def wait(self) -> None:
-        """Do nothing: a recorder does not wait for a browser."""
+        """Do nothing, because a recorder has no browser to wait for."""
 
     def close(self) -> None:
-        """Do nothing: a recorder has no open connection."""
+        """Do nothing, because a recorder has no connection to close."""
 
 
 def subtitle(robot: Robot) -> str:
@@ -319,9 +324,9 @@ def subtitle(robot: Robot) -> str:
 
 
 class Page:
-    """Page of a robot in a scene, with its drawings, and the entries that its scripts read.
+    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read.
 
-    `entries` begins with the entries of the stage, which follow from the poses of the first frame.
+    `entries` contains this data. `set_stage` computes its first part from the first frame.
     """
 
     def __init__(self, robot: Robot, scene: str, tool: str | None, frame: str | None) -> None:
@@ -329,10 +334,10 @@ class Page:
         self.window, self._sent = Recorder(), set[str]()
         self.meshcat = Visualizer(window=self.window)
         self.drawing = self.draw(robot, "robot")
-        # Path of each body's node, in the order of Pinocchio's joints from 1 on.
+        # Path of each body's node, in the order of Pinocchio's joints (without the universe).
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
         self.entries: dict[str, object] = {}
-        # Name, node, position and force direction of each thruster.
+        # For each thruster: its name, node, position and direction of its force.
         self.nozzles: list[dict[str, object]] = []
         for item, (name, *_) in named_inputs(robot.inputs):
             if isinstance(item, Thruster):
@@ -349,7 +354,7 @@ class Page:
         return Drawing(robot, self.meshcat[node], look, self._sent, prefix)
 
     def set_stage(self, poses: Array, about: str, held: Sequence[Drawing] = ()) -> None:
-        """Set the entries of the stage by the poses (njoints - 1, 7) of the first frame."""
+        """Set `entries`, given the poses (njoints - 1, 7) in the first frame."""
         robot, nodes = self.robot, self.nodes
         points = self.drawing.points(poses)
         low, high = points.min(axis=0), points.max(axis=0)
@@ -359,7 +364,7 @@ class Page:
         orbit: dict[str, object] = {}
         if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
-            # The z axis points away from the central body, and the x axis along the orbit.
+            # On the page, z points away from the central body, and x along the orbit.
             radial, along, normal = field.axes.T
             far = robot.orbit.radius / robot.orbit.body_radius
             rate = robot.orbit.mean_motion
@@ -377,7 +382,7 @@ class Page:
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
             apart = _APART * size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
-            # The wheel spins with its body if its speed is a state.
+            # If the speed of the wheel is a state, the wheel rotates with the node of its joint.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         self.entries = {
@@ -395,8 +400,9 @@ class Page:
         }
 
     def html(self, mode: str, points: Array, **entries: object) -> str:
-        """Return the page, with further entries; its camera shows the points (M, 3)."""
-        # A live page gets its commands from its server. Other pages open no connections.
+        """Return the page with additional entries; its camera shows all points (M, 3)."""
+        # A live page receives its commands from the server. Other pages contain them and open no
+        # connection.
         live, digits = mode == "live", max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **self.entries,
@@ -406,7 +412,8 @@ class Page:
             **entries,
             "commands": [] if live else [_base64(each) for each in self.window.commands()],
         }
-        # In a script element, only the end tag and the start of a comment have a special meaning.
+        # In a script element, only an end tag or the start of a comment has a special meaning. Both
+        # begin with "<", which is therefore escaped.
         data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
         fields = {
             "title": escape(self.robot.name),

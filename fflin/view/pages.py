@@ -1,6 +1,6 @@
-"""The page of a motion, with its panel of numbers and plots, and the page of natural modes.
+"""HTML page of a motion, with a panel of values and plots; HTML page of natural modes.
 
-The page of natural modes animates the modes of a robot, one at a time.
+The page of natural modes animates one mode of a robot at a time.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from fflin.simulation.report import STATES, Curve
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 
-# Number of poses in a period, and the period's duration on the screen [s]. The amplitude is
-# limited by the rotation _ANGLE [rad], and by the displacement _SHARE relative to the robot's
-# size.
+# Number of poses in a period, and the duration of a period on the screen [s]. The amplitude is
+# chosen such that no rotation exceeds _ANGLE [rad], and no displacement exceeds _SHARE times the
+# robot's size.
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-# Length of the largest force's arrow. The camera follows the base by default if its path is longer
-# than _FAR. Both are in robot sizes.
+# ARROW is the length of the largest force's arrow. If the motion extends over more than _FAR, the
+# camera follows the base by default. Both are relative to the robot's size.
 ARROW, _FAR = 0.62, 20.0
 
-# Limits of one integration step of a payload's flight before capture: time [s], and phase [rad] of
-# the fastest oscillation.
+# Largest step of the integration of a payload's flight before its capture: in time [s], and in the
+# phase [rad] of its fastest oscillation.
 _STEP, _SWING = 0.05, 0.3
 
-# Largest number of frames; more would enlarge the file without a visible effect.
+# Largest number of frames. More frames would enlarge the file without a visible effect.
 _MOST_FRAMES = 3000
 
 # Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14
 
-# Lines below this fraction of the largest line of their plot are not drawn.
+# Lines that are smaller than this fraction of the largest line in their plot are not drawn.
 _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
@@ -64,7 +64,7 @@ def motion_page(
     follow: bool | None,
     target: Array | None,
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a motion, and notes about missing drawings; see `visualize`."""
+    """Return the page of a motion, and notes about parts that are not drawn; see `visualize`."""
     robot, shown = page.robot, frame_indices(motion.t, fps, speed)
     frame = cast("Frame", motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
@@ -99,7 +99,7 @@ def motion_page(
         {"type": "set_animation", "animations": clips, "options": options, "path": ""}
     )
 
-    # Robots of the phases, if known. After a capture, the robot includes the payload.
+    # The robot of each phase, if known. After a capture, it includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
@@ -111,7 +111,7 @@ def motion_page(
     points = np.concatenate(corners)
     page.floor[2] = float(points[:, 2].min())
     if follow is None:
-        # If the whole of a long path were in view, the robot would be only a dot.
+        # If the camera showed the whole of a long path, the robot would be only a dot.
         follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
         points = frame_points(page, film, follow=True)
@@ -133,7 +133,7 @@ def motion_page(
 
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
-    """Return points (M, 3) that the camera must show: body corners and force tips."""
+    """Return points (M, 3) that the camera must show: corners of the bodies, tips of the forces."""
     chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
@@ -146,7 +146,7 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 
 
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
-    """Return the trails (also of a moving target `goals`), wrenches and plumes of a page."""
+    """Return trails, arrows and plumes of a page; a moving target `goals` also has trails."""
     trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
         trails, followed = {"base": film.poses[:, 0, :3]}, {"base": goals[:, 0, :3]}
@@ -172,7 +172,7 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
 
 
 def moved(poses: Array, point: Array) -> Array:
-    """Return the positions (N, 3) of a point (3,) that moves with poses (N, 7)."""
+    """Return the world positions (N, 3) of a point (3,) in a frame with poses (N, 7)."""
     found: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
     return found
 
@@ -188,7 +188,7 @@ class Playback(NamedTuple):
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:
-    """Return the indices of the samples at t (N,) [s] that are nearest to a film's frames."""
+    """Return, for each frame of an animation, the index of the nearest sample in t (N,) [s]."""
     duration = float(t[-1] - t[0])
     count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
     wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
@@ -199,7 +199,7 @@ def frame_indices(t: Array, fps: float, speed: float) -> Array:
 
 
 def play_back(state: StateMap, q: Array, u: Array) -> Playback:
-    """Compute the data of an animation from rows of a motion; wrenches are in the state's frame."""
+    """Compute an animation from rows of a motion, whose wrenches are in the state's frame."""
     robot, data, groups = state.robot, state.robot.create_data(), Actuation(state).groups
     poses = body_poses(robot, q)
     com = np.array([pin.centerOfMass(robot.model, data, row).copy() for row in q])
@@ -218,7 +218,7 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
 
 
 def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
-    """Yield each capture and the poses (N, njoints - 1, 7) of its payload at the rows `shown`."""
+    """Yield each capture with the poses (N, njoints - 1, 7) of its payload at the rows `shown`."""
     parts = motion._phases
     first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
     for k, caught in enumerate(parts):
@@ -233,7 +233,7 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
 
 
 def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
-    """Return the poses of an undamped, free payload at times [s] before its capture."""
+    """Return the poses of a payload at times [s] before its capture, in undamped, free flight."""
     payload = caught.payload.replace(damping=0.0)
     state = StateMap(payload, frame=frame)
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
@@ -251,7 +251,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
 
 
 def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
-    """Return the poses of a payload on the robot that carries it, at rows of q (N, nq)."""
+    """Return the poses of a captured payload, for rows of q (N, nq) of the combined robot."""
     model, data = robot.model, robot.model.createData()
     names = [f"{caught.prefix}.{name}" for name in list(caught.payload.model.names)[ROOT + 1 :]]
     places = [find_frame(model, caught.prefix), *(find_joint(model, name) for name in names)]
@@ -265,7 +265,7 @@ def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
     """Return {quantity: (unit, errors (N,))} of q (N, nq) from the target.
 
-    Wheels and modes are left out.
+    Wheels and modes are excluded.
     """
     goals = np.broadcast_to(target, q.shape)
     apart = np.array([pin.difference(robot.model, *each) for each in zip(goals, q, strict=True)])
@@ -284,7 +284,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
-    """Return the readouts and plots of the rows `shown`, with errors from the target (k, nq)."""
+    """Return readouts and plots of the rows `shown`, with errors from the target (k, nq)."""
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
@@ -304,7 +304,8 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             lines.append(each._replace(values=each.values[shown], reference=reference))
         least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
         seen = [each for each in lines if _size(each) >= least]
-        # States of the base have errors instead. Rates are shown only if a limit is near.
+        # States of the base are not plotted, because their errors are. Rates are plotted only near
+        # a limit.
         of_base = whole[0].group in STATES and whole[0].group not in JOINTS
         if any(each.near or not title.endswith("rates") for each in seen) and not of_base:
             plots.append(_plot(title, seen))
@@ -320,18 +321,18 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 
 
 def _size(curve: Curve) -> float:
-    """Return the largest magnitude of a curve."""
+    """Return the largest magnitude of a curve and its reference."""
     rows = curve.values if curve.reference is None else (*curve.values, *curve.reference)
     return float(np.abs(rows).max())
 
 
 def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
-    """Return a plot of curves, with each limit that a curve comes near."""
+    """Return the plot of some curves, with the limits that they come close to."""
     group = lines[0].group
     return {
         "title": title,
         "unit": lines[0].unit,
-        # A name has the same colour in all plots of a family.
+        # All plots of a family show a name in the same colour.
         "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
         "lines": [
             {
@@ -346,7 +347,7 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
 
 
 def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a robot's modes, and notes about missing drawings; see `visualize`."""
+    """Return the page of a robot's modes, and notes about parts that are not drawn."""
     robot, lin = page.robot, found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
@@ -383,7 +384,7 @@ def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
 
 
 def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
-    """Return poses (_PHASES, njoints - 1, 7) over a period of x0 + Re(a shape exp(i phase))."""
+    """Return the poses (_PHASES, njoints - 1, 7) of a mode's oscillation over one period."""
     robot, half = state.robot, len(lin.x0) // 2
 
     def poses(amplitude: float) -> Array:
@@ -392,7 +393,7 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
         x[:, :half] += amplitude * (mode.shape[:half] * turns).real
         return body_poses(robot, state.points(x)[1])
 
-    # Displacement of the corners per unit amplitude, computed with a small amplitude.
+    # Largest displacement of a corner per unit amplitude, computed with a small amplitude.
     small = 1e-4
     rest = drawing.points(body_poses(robot, lin.q))
     moved = np.array([drawing.points(each) - rest for each in poses(small)])

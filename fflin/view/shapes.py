@@ -1,4 +1,4 @@
-"""Shapes of a robot: visual elements of its URDF, bent appendages, or boxes from inertias.
+"""Visible shapes of a robot, from its URDF or from its inertias.
 
 Meshes are read from their files and simplified.
 """
@@ -35,7 +35,7 @@ _DENSITY = 1000.0  # [kg/m^3] density of a ball that represents a mass
 
 @dataclass(frozen=True)
 class Shape:
-    """One visible piece of a robot, rigidly fixed to the body behind one joint."""
+    """Visible piece of a robot, rigidly fixed to the body that a joint moves."""
 
     joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
@@ -48,7 +48,7 @@ class Shape:
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """Return a robot's shapes, from its URDF or its inertias, and notes about missing drawings."""
+    """Return the shapes of a robot, and notes about visual elements that are not drawn."""
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
@@ -164,8 +164,9 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         moments, axes = np.linalg.eigh(inertia.inertia)
         if np.linalg.det(axes) < 0.0:
             axes[:, 0] = -axes[:, 0]
-        # A uniform box has moments m (b^2 + c^2)/12. Inertias of files may be impossible, so
-        # negative squares are set to zero.
+        # Find the sides of a uniform box from its moments of inertia m (b^2 + c^2)/12. If the
+        # inertia in the file is not physically realisable, a squared side may be negative; it is
+        # set to zero.
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
@@ -176,10 +177,11 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
 
 
 class Bending(NamedTuple):
-    """First-order motion of an appendage's links by its modes, as a rotation about its frame.
+    """Linear map from an appendage's modal amplitudes to a rotation about its frame.
 
-    The rotation is the best fit to mode shapes with the given participation. If no mode has a
-    rotation part, the motion is a translation.
+    The links of the appendage are drawn with this rotation, which is the best fit to the
+    participation of the modes. If no mode has a rotational participation, the links are translated
+    instead.
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
@@ -190,7 +192,7 @@ class Bending(NamedTuple):
     center: Array  # (3,) position in the frame of a ball that represents the links
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
-        """Return the placement of the bent frame in the world."""
+        """Return the placement, in the world, of the appendage's frame after bending."""
         shift, turn = np.split(self.twist @ q[self.modes], 2)
         return data.oMi[self.carrier] * self.frame * pin.SE3(pin.exp3(turn), shift)
 
@@ -218,7 +220,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
 
 
 def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
-    """Return {link: bending} for the links of a URDF that are fixed to an appendage's frame."""
+    """Return {link: bending} for all links of a URDF that are fixed to an appendage's frame."""
     children: dict[str, list[str]] = {}
     for joint in root.find_all("joint"):
         ends = [joint.find_all(end) for end in ("parent", "child")]
@@ -240,7 +242,7 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
 
 
 def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
-    """Yield the shapes that represent undrawn appendages."""
+    """Yield shapes that represent appendages without visual elements."""
     for item in robot.appendages:
         if isinstance(item, Slosh):
             joint = robot.model.getJointId(item.modes[1])
@@ -250,8 +252,8 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
             bending = bendings(robot)[item.title]
             mass = float(np.square(item.participation[:3, 0]).sum())
             size = _radius(mass or 1.0)
-            # Without mass the appendage only rotates, so a box is drawn: unlike a sphere, it shows
-            # rotation.
+            # An appendage without modal mass only rotates. It is drawn as a box, because the
+            # rotation of a sphere would not be visible.
             kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
             yield Shape(bending.node, kind, sides, pin.SE3(np.eye(3), bending.center))
 
@@ -263,10 +265,12 @@ def _radius(mass: float) -> float:
 Color = tuple[float, float, float, float]
 Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 
-# Details smaller than this fraction of a mesh's extent are dropped, which halves most CAD meshes.
+# Details smaller than this fraction of a mesh's extent are dropped. This halves the number of
+# triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles; the grid is made coarser until a mesh has fewer.
+# Largest number of triangles of a mesh. The grid is made coarser until the mesh has at most this
+# number, or the cells become too large.
 _LARGEST = 20_000
 
 
@@ -280,7 +284,7 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file in its own unit of length; raise ValueError if nothing is visible."""
+    """Read a mesh file, in its own unit of length; raise ValueError if it cannot be drawn."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -290,7 +294,8 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
-    # The cache's key contains time and size of the file, so a changed file is read again.
+    # The key of the cache contains the file's size and modification time, so a changed file is read
+    # again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -313,7 +318,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices [m], faces and colour of each part of a COLLADA file, [] if malformed."""
+    """Return vertices [m], faces and colour of each part of a COLLADA file; [] if malformed."""
     import trimesh
 
     try:
@@ -345,7 +350,7 @@ def _triangles(path: Path) -> tuple[Array, Indices]:
 
 
 def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
-    """Merge the vertices in each cell of a grid; drop collapsed triangles."""
+    """Merge all vertices in the same cell of a grid; drop triangles that collapse."""
     if not cell:
         return vertices[:0].astype(np.float32), faces[:0].astype(np.uint32)
     _, first, inverse = np.unique(
@@ -354,7 +359,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # After the merge, several triangles may be equal.
+    # After the merge, several triangles may be equal; keep only one of them.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Robots and motions in meshcat: a self-contained file, pictures, or a live page."""
+"""Function `visualize`, which shows robots, motions and modes as a file or as a live page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SCENES = ("space", "lab")
 
-# Sizes [px] of a picture with its panel, of a picture in a strip, and of a GIF.
+# Sizes [px] of a single picture of the whole page, of a picture in a strip, and of a GIF.
 _PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
 
 # Longest duration of an animation [s]; longer motions are shown faster.
@@ -214,7 +214,7 @@ def _temporary(name: str) -> Path:
 
 
 def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
-    """Return {ending: path} of the given files, or raise an error if one cannot be written."""
+    """Return {ending: path} of the requested files; raise an error if one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -233,7 +233,7 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
-    """Return the frame `tool`; by default, "tool" or the last link of the longest chain."""
+    """Return the tool frame; the default is "tool", or else the end of the longest chain."""
     if tool is not None:
         find_frame(robot.model, tool)
         return tool
@@ -253,7 +253,7 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
-    """Return the checked fps and speed; for speed=None, a speed that suits the duration [s]."""
+    """Check fps and speed, and return them; for speed=None, choose a speed for the duration [s]."""
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
@@ -264,7 +264,7 @@ def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float
 
 
 def _robot_of(robot: Robot, motion: Motion) -> Robot:
-    """Return the robot of a motion; a run of a campaign may have other bodies."""
+    """Return the robot of a motion, because a run of a campaign may have a perturbed robot."""
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
@@ -288,7 +288,7 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 
 
 def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
-    """Return the times [s] of pictures, or raise an error if one is outside the motion."""
+    """Check and return the times [s] of pictures; raise an error if one is outside the motion."""
     times = [number("a time", time) for time in times]
     if not times or not all(start <= time <= end for time in times):
         raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
@@ -304,7 +304,8 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # A motion that settles is fastest at the beginning, but a tracking motion never stops.
+        # A motion that settles is fastest at the beginning, so more pictures are early. A tracking
+        # motion never settles, so its pictures are evenly spaced.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)
