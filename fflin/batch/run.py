@@ -335,7 +335,7 @@ _TURN = Lock()
 def _starting() -> Iterator[None]:
     """Start processes that import nothing from the working folder and ignore Ctrl-C.
 
-    By default, a process that multiprocessing starts imports modules from the working folder first,
+    By default, a process started by multiprocessing looks for modules in the working folder first,
     until it has copied `sys.path` from its parent process. Ctrl-C also reaches the parent process,
     which then ends its worker processes.
     """

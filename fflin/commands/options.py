@@ -523,7 +523,7 @@ SPECIAL: dict[str, dict[str, Form]] = {
 def add_command(
     commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], Report]
 ) -> None:
-    """Add the command with the name of the function `run`, which executes it, and its options.
+    """Add a command and its options. The function `run` executes the command and gives its name.
 
     The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
     the options in `COMMON`; ``--help all`` lists all options.

@@ -107,7 +107,10 @@ def turn_held(robot, point):
 
 
 def push(work, tree, pushing):
-    """Write the generalised force of the inputs `pushing`, in base axes, at the offset of c."""
+    """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
+
+    Forces and torques on the base in `pushing` are in base axes.
+    """
     size, count = len(tree.row), len(tree.wrench_body)
     for index in range(size):
         store(work, tree.c + index, 0.0)

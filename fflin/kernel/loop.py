@@ -295,7 +295,8 @@ class RunStatistics(
     - `law` computes states.
     - Errors are relative to the state `x_ref` (nx,), whose attitude is in the point of `path`. With
       a moving reference, they are relative to the rows `q_ref` and `nu_ref`.
-    - `kind` (nx,) is the kind of each state: 0 if it has none, -1 if its error is not recorded.
+    - `kind` (nx,) is the index of each state's kind, from 1 on. It is 0 for a state of no kind, and
+      -1 for a state whose error is not recorded.
     - An error has settled when it stays below the fraction `settled` of its largest value, or below
       `tolerance` (kinds,).
     - Three quantities are recorded at the `steps` (times,): the errors of the kinds, the inputs,

@@ -36,7 +36,7 @@ LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Decorate a rarely called function, which is not inlined to save compilation time."""
+    """Mark a rarely called function: it is not inlined, which saves compilation time."""
     HOW[function] = "called"
     return function
 

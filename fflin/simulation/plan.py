@@ -47,8 +47,8 @@ _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
 # the automatic time step. More steps than _ENDLESS (some hours) are refused if `every` is not
 # given.
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
-# If `every` is not given, at most _MANY_ROWS steps are all recorded. Of more steps, about _FEW_ROWS
-# are recorded.
+# If `every` is not given, all steps of a run with at most _MANY_ROWS steps are recorded. If a run
+# has more steps, only about _FEW_ROWS of them are recorded.
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000
 _FOREVER = 1e100  # [s]; its inverse squared does not underflow
 

@@ -121,9 +121,9 @@ class ModelDerivatives:
 
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # If the accelerations change linearly with a parameter, the product of such an output and
-        # the robot's mass is quadratic in the parameter. So a difference of three values is exact
-        # for any step.
+        # These outputs are multiplied by the robot's mass. If the accelerations change linearly with
+        # a parameter, the products are quadratic in the parameter. So a difference of three values
+        # is exact for any step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)

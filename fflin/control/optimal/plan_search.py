@@ -198,8 +198,9 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # If the motion integrated as one does not halve the violation, errors grow too
-                # fast along it. The trial with separate intervals is then returned.
+                # `one` is integrated in one piece. If its violation is more than half of the
+                # previous one, errors grow too fast along the motion. Then the trial with separate
+                # intervals is returned.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
