@@ -96,10 +96,12 @@ class ModelDerivatives:
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
         rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
+        for joint in self._joints:
+            rows = [row for row, one in enumerate(parameters) if joint in one.bodies]
+            changes = np.array([parameters[row].bodies[joint] for row in rows]).reshape(-1, 10)
+            for part, of_bodies in zip(rates, self._of_bodies, strict=True):
+                part[rows] += np.tensordot(changes, of_bodies[joint - ROOT], 1)
         for row, one in enumerate(parameters):
-            for joint, change in one.bodies.items():
-                for part, of_bodies in zip(rates, self._of_bodies, strict=True):
-                    part[row] += np.tensordot(change, of_bodies[joint - ROOT], 1)
             if not one.bodies:
                 for part, of_force in zip(rates, self._over_force(one), strict=True):
                     part[row] = of_force
@@ -121,9 +123,9 @@ class ModelDerivatives:
 
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # These outputs are multiplied by the robot's mass. If the accelerations change linearly with
-        # a parameter, the products are quadratic in the parameter. So a difference of three values
-        # is exact for any step.
+        # These outputs are multiplied by the robot's mass. If the accelerations change linearly
+        # with a parameter, the products are quadratic in the parameter. So a difference of three
+        # values is exact for any step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
