@@ -37,7 +37,7 @@ def is_number(value: object) -> bool:
     """Return whether a TOML value is a finite number."""
     # The limit 1e100 keeps the norm of a vector of such numbers finite. It also excludes integers
     # that no float can represent.
-    return isinstance(value, int | float) and value is not True and abs(value) < 1e100
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100
 
 
 class TomlFile:

@@ -53,6 +53,8 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
     [
         ("q_b = [1, 2]", 3, r"\[1, 2\]"),
         ("q_b = true", 3, "True"),
+        ("q_b = {uniform = [false, 0.1]}", 3, "False"),
+        ("q_b = {distribution = 'norm', scale = false}", 3, "False"),
         ("q_b = inf", 3, "dispersion"),
         ("q_b = {}", 3, "dispersion"),
         ("q_b = {uniform = [1, 2, 3]}", 3, "dispersion"),
