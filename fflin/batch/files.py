@@ -178,8 +178,9 @@ class MemoryStore:
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
                 raise MemoryError
-            for key in shapes.keys() - self.arrays:
-                self.arrays[key] = np.empty((count, *shapes[key]))
+            for key, shape in shapes.items():
+                if key not in self.arrays:
+                    self.arrays[key] = np.empty((count, *shape))
         except (MemoryError, ValueError):
             raise InputError(
                 f"{count:,} rows do not fit into memory; write them to a file with "

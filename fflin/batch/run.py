@@ -17,13 +17,12 @@ from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from threading import Lock, Thread, local
-from types import NoneType
 from typing import ParamSpec, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.validation import Array, instance, whole
+from fflin.base.validation import Array, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
 
@@ -76,8 +75,9 @@ class Execution(ExitStack):
     ) -> None:
         if executor is not None and workers is not None:
             raise InputError("executor and workers are both given; give only one of them")
-        kinds = futures.Executor, NoneType
-        instance("executor", executor, kinds, "a concurrent.futures.Executor")
+        if executor is not None and not hasattr(executor, "submit"):
+            kind = type(executor).__name__
+            raise InputError(f"executor has type {kind}, expected a concurrent.futures.Executor")
         for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
             if value is not None:
                 whole(name, value, 1)

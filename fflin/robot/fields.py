@@ -91,8 +91,9 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) 
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
     # A limit for all joints does not apply to wheels, because wheels are much faster.
-    wheels = {f"{of}.{name}" for of in ("q_m", "qdot_m") for name, _ in named_wheels(inputs)}
-    whole = {key: of_states.pop(key) for key in {"q_m", "qdot_m"} & of_states.keys()}
+    groups: Sequence[str] = ("q_m", "qdot_m")
+    wheels = {f"{group}.{name}" for group in groups for name, _ in named_wheels(inputs)}
+    whole = {group: of_states.pop(group) for group in groups if group in of_states}
     found = by_name("input or state", whole, (*keys, *states))
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
     found |= by_name("input or state", of_states, (*keys, *states))
@@ -157,8 +158,9 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
     if "joints" in state:
         values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
         state["joints"] = by_joint(values, robot.joint_names, robot.joint)
-    for name in {"rpy", "position"} & state.keys():
-        state[name] = three_numbers(f"{what} {name}", state[name])
+    for name in ("rpy", "position"):
+        if name in state:
+            state[name] = three_numbers(f"{what} {name}", state[name])
     if "velocity" in state:
         rates = numbers(f"{what} velocity", state["velocity"], "name", f"{what} velocity")
         state["velocity"] = rates_by_name(robot.joint_names, rates)

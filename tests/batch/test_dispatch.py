@@ -223,6 +223,19 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, k
     assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
 
 
+def test_an_object_that_only_submits_is_an_executor(robot):
+    class Submitting:
+        def __init__(self, pool):
+            self.submit = pool.submit
+
+    q = np.tile(robot.neutral(), (4, 1))
+    with ThreadPoolExecutor(1) as pool:
+        batch = fflin.sweep(robot, q, engine="python", executor=Submitting(pool), chunk=2)
+    np.testing.assert_array_equal(batch.A, fflin.sweep(robot, q, engine="python").A)
+    with pytest.raises(fflin.InputError, match="executor has type int"):
+        fflin.sweep(robot, q, executor=3)
+
+
 def test_an_executor_that_is_shut_down_is_one_line(robot):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()

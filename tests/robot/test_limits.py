@@ -244,3 +244,10 @@ def test_one_side_of_a_motor_leaves_the_other_to_the_urdf():
     effort = limits_of(robot)["tau_m.joint_1"][1]
     own = robot.replace(inputs=[fflin.JointTorque("joint_1", min=-1.0), fflin.BaseTorque()])
     assert limits_of(own)["tau_m.joint_1"] == (-1.0, effort)
+
+
+def test_limits_of_groups_have_the_order_of_the_state():
+    robot = fflin.load("planar_detumble")
+    groups = {"qdot_m": 2.0, "q_m": 1.0}
+    names = [name.partition(".")[0] for name in robot.replace(limits=groups).limits]
+    assert names == ["q_m"] * robot.n + ["qdot_m"] * robot.n
