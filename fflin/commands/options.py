@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
-import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
 from fflin.commands.parser import (
     FORMS,
-    Command,
     Form,
-    Help,
     OutputFile,
     count_of,
     many,
     number,
     one,
 )
-
-if TYPE_CHECKING:
-    from fflin.commands.results import Report
 
 # Titles of the groups of options in the help.
 POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
@@ -518,30 +508,3 @@ SPECIAL: dict[str, dict[str, Form]] = {
         "output-file": _saved(endings=(".npz", ".h5", ".csv", ".mat")),
     },
 }
-
-
-def add_command(
-    commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], Report]
-) -> None:
-    """Add a command and its options. The function `run` executes the command and gives its name.
-
-    The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
-    the options in `COMMON`; ``--help all`` lists all options.
-    """
-    name, (summary, _, example) = run.__name__, (run.__doc__ or "").partition("\n\n")
-    command = commands.add_parser(
-        name,
-        add_help=False,
-        help=summary[:1].lower() + summary[1:].removesuffix("."),
-        description=summary,
-        epilog=example,
-    )
-    # A negative number such as -1e-3 is a value, not an option.
-    command._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-    about = "show help for the common options; --help all shows help for all options"
-    command.add_argument("-h", "--help", nargs="?", metavar="all", action=Help, help=about)
-    command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
-    forms = {**FORMS, **SPECIAL.get(name, {})}
-    command.add(OUTPUT, {"json": "print the results as one JSON object"}, forms)
-    for title, options in OPTIONS[name].items():
-        command.add(title, options, forms)

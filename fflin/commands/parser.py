@@ -307,18 +307,6 @@ def short_help(command: argparse.ArgumentParser) -> str:
     return formatter.format_help()
 
 
-def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[tuple[Path, OutputFile]]]:
-    """Return the input files in the arguments, and the output files with their readers."""
-    inputs, outputs = list[Path](), list[tuple[Path, OutputFile]]()
-    for action in arguments.command._actions:
-        value = getattr(arguments, action.dest, None)
-        if value is not None and isinstance(action.type, OutputFile):
-            outputs.append((value, action.type))
-        elif value is not None and action.type in (input_file, input_name):
-            inputs.append(Path(value))
-    return inputs, outputs
-
-
 def settle_former_names(arguments: argparse.Namespace) -> None:
     """Accept the former names --step and --dt of --dt and --sample, with a warning."""
     if (step := getattr(arguments, "step", None)) is not None:
@@ -327,8 +315,9 @@ def settle_former_names(arguments: argparse.Namespace) -> None:
             said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = step
-        warnings.warn(said, FflinWarning, stacklevel=2)
     elif (sample := getattr(arguments, "former_dt", None)) is not None:
         said = f"--dt has the new name --sample; write --sample {sample:g}"
         arguments.sample = sample
-        warnings.warn(said, FflinWarning, stacklevel=2)
+    else:
+        return
+    warnings.warn(said, FflinWarning, stacklevel=2)
