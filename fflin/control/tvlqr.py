@@ -171,7 +171,7 @@ class GainSchedule(Schedule):
             pieces[power : power + 4] += reach @ self._cubics.c[::-1]
         return pieces.swapaxes(0, 1).reshape(len(self.t) - 1, 7, -1)
 
-    def defect(self, at: Callable[[Array], riccati.Coefficients]) -> float:
+    def defect(self, at: Callable[[Array], Array]) -> float:
         """Return the largest relative residual of the differential equation between knots."""
         middle = 0.5 * (self.t[:-1] + self.t[1:])
         P, rate = self._cubics(middle), self._cubics(middle, 1)
@@ -330,9 +330,9 @@ def tvlqr(
     Q, R, _ = cost_weights(traj, Q, R, None)
     Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
 
-    def at(times: Array) -> riccati.Coefficients:
+    def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)
-        return riccati.Coefficients(A, riccati.spread(B, R), np.broadcast_to(Q, A.shape))
+        return np.array((A, riccati.spread(B, R), np.broadcast_to(Q, A.shape)))
 
     residual = 0.0
     with riccati.bounded_by("smaller weights or a larger R"):
