@@ -17,7 +17,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, ArrayLike, instance, number, truth, vector, whole
-from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
+from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
 from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
@@ -193,10 +193,10 @@ class Plan:
             setattr(other, name, value)
         return other
 
-    def channel(self, law: Callable[..., Array], speeds: Callable[..., Array]) -> Channel:
-        """Return the channel from a law's commands to the inputs; its delay line is empty."""
+    def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
+        """Return the inputs under a law as a function of the step and the arguments of the law."""
         times = self.times
-        return Channel(law, self.initial, self.limits, times.sample, times.delay, speeds)
+        return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
