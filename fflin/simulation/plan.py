@@ -274,7 +274,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         sample = _positive("sample", sample)
     else:
         by = decider(policy)
-        made = by if hasattr(by, "dt") else getattr(policy, "lin", None)
+        made = by if hasattr(by, "dt") else getattr(by, "lin", None)
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest = 0.0
     if not sample and follows:
