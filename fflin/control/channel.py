@@ -27,7 +27,6 @@ class Saturation(NamedTuple):
     low: Array  # (nu,)
     high: Array
     wheels: Wheels = empty(WHEELS)
-    wheel_names: tuple[str, ...] = ()  # in the order of `wheels`
     pulses: Pulses = empty(PULSES)
 
     @property
@@ -61,7 +60,7 @@ def saturation(
             most_speed=most_speed,
             stiffness=1.0 / (mobility * dt),
         )
-        within = within._replace(wheels=wheels, wheel_names=tuple(spun))
+        within = within._replace(wheels=wheels)
     if not (pulsed and (thrusters := pulsed_thrusters(robot))):
         return within
     at, time = list(thrusters), sample * dt

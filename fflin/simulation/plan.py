@@ -179,7 +179,7 @@ class Plan:
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
-        self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
+        self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         self.steered = fed_back(policy)  # states that are known to be fed back
         # Function noise(t) of the policy, which returns measurement noise, or None.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)

@@ -321,7 +321,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if lin is None:  # a model in discrete time without its motion between samples
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = [lin.state_names.index(f"qdot_m.{name}") for name in plan.limits.wheel_names]
+    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of their speeds in x
     applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
