@@ -18,7 +18,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
 from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import instance, is_rotation
-from fflin.base.writing import remember
+from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS
@@ -27,7 +27,7 @@ from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic, is_impossible
-from fflin.robot.urdf.reader import ignored, read_urdf
+from fflin.robot.urdf.reader import SIZE_LIMIT, describe, ignored
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
@@ -112,7 +112,7 @@ def load(
     if found.path.suffix.lower() == ".toml":
         document, found, own, of_file = _read_robot_file(found)
         later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
-    urdf = read_urdf(found.path)
+    urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path)
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
