@@ -21,8 +21,7 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import stands_for_any
 from fflin.base.validation import Array, frozen
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
-from fflin.robot.fields import checked_inputs
-from fflin.robot.inputs import Input, ReactionWheel, named_wheels
+from fflin.robot.inputs import Input, ReactionWheel, checked_inputs, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
 from fflin.robot.urdf.description import is_impossible
