@@ -297,8 +297,8 @@ def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tupl
 
     `bare` is the robot without wheels and modes.
     """
-    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
-        raise InputError(f"inputs is {value!r}, expected a sequence of at least one input")
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(f"inputs is {value!r}, expected a sequence of inputs")
     inputs: list[Input] = []
     for item in value:
         if not isinstance(item, Input):
@@ -315,7 +315,10 @@ def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tupl
             )
         inputs += [replace(item, joint=name) for name in found if name not in passive]
     if not inputs:
-        raise InputError("all inputs are torques of passive joints; add an input that is not")
+        raise InputError(
+            f"inputs is {value!r}, expected at least one input that is not the torque of a passive "
+            "joint"
+        )
     names = [name for _, own in named_inputs(inputs) for name in own]
     for each in names:
         if names.count(each) > 1:

@@ -233,11 +233,9 @@ class Robot(Coordinates):
         require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            passive = checked_passive(fields["passive"], self._bare)
-            inputs = [x for x in self.inputs if getattr(x, "joint", None) not in passive]
-            if not inputs:
-                raise InputError("all inputs are torques of passive joints; add another input")
-            robot = replace(self, passive=passive, inputs=tuple(inputs))
+            robot = replace(self, passive=checked_passive(fields["passive"], self._bare))
+            driven = [x for x in self.inputs if getattr(x, "joint", None) not in robot.passive]
+            fields = {"inputs": driven, **fields}
         if "inputs" in fields:
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:

@@ -3,7 +3,7 @@
 import hashlib
 import sys
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
@@ -60,18 +60,18 @@ def describe(document: bytes, path: Path) -> Urdf:
     root, notes = plain_root(document, path)
     links, joints = description.read_tree(root)
     mimics = description.resolve_mimics(joints)
-    # A continuous joint does not count full turns. A leader must count them if its full turn
-    # displaces a mimic joint.
-    counted = {
-        mimic.leader
-        for name, mimic in mimics.items()
-        if joints[name].type != "continuous" or not mimic.multiplier.is_integer()
-    }
+    # A continuous joint does not count full turns, but a revolute joint does. A leader must count
+    # them if its full turn displaces a mimic joint.
+    for name, (leader, multiplier, _) in mimics.items():
+        turning = joints[leader].type == "continuous"
+        if turning and not (joints[name].type == "continuous" and multiplier.is_integer()):
+            limits = (joints[leader].limits or {}) | _UNBOUNDED
+            joints[leader] = joints[leader]._replace(type="revolute", limits=limits)
     root_joint = "root_joint"
     while root_joint in joints or root_joint in links:
         root_joint += "_"
     name = root.attributes.get("name", "").strip()
-    clean = write_urdf(name, links, joints, counted)
+    clean = write_urdf(name, links, joints)
     try:
         with ThreadPoolExecutor(1) as other:
             usual = threading.stack_size(_STACK)
@@ -145,16 +145,8 @@ def ignored(
             yield "passive", names, said
 
 
-def write_urdf(
-    name: str,
-    links: Mapping[str, Link],
-    joints: Mapping[str, JointElement],
-    counted: Collection[str],
-) -> str:
-    """Return a URDF of links and joints, with numbers in full precision.
-
-    Continuous joints in `counted` become revolute joints, because these count full turns.
-    """
+def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]) -> str:
+    """Return a URDF of links and joints, with numbers in full precision."""
     parts = []
     for link in links.values():
         inertial = ""
@@ -165,8 +157,6 @@ def write_urdf(
         parts.append(_tag("link", {"name": link.name}, inertial))
     for joint in joints.values():
         kind, limits = joint.type, _UNBOUNDED if joint.limits is None else joint.limits
-        if kind == "continuous" and joint.name in counted:
-            kind, limits = "revolute", limits | _UNBOUNDED
         inside = _tag("parent", {"link": joint.parent}) + _tag("child", {"link": joint.child})
         inside += _origin(joint.origin) + _tag("axis", {"xyz": joint.axis})
         inside += _tag("dynamics", {"damping": joint.damping, "friction": joint.friction})
