@@ -415,17 +415,13 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
     return least
 
 
-def first_impossible(
-    model: pin.Model,
-    appendages: Sequence[Appendage],
-    bodies: Mapping[int, tuple[Array, Array, Array]],
-) -> int | None:
+def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]) -> int | None:
     """Return the index of the first row in which modes need more inertia than their body has.
 
-    `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
-    The result is None if all N rows are possible.
+    `bodies` maps joints of the robot without wheels and modes to masses (N,), centres of mass
+    (N, 3) and inertias (N, 3, 3). The result is None if all N rows are possible.
     """
-    found = [_carried(model, item) for item in appendages]
+    found = [_carried(robot._bare.model, item) for item in robot.appendages]
     impossible = []
     for joint, rows in bodies.items():
         if of_body := [L for carrier, _, L in found if carrier == joint]:
