@@ -81,7 +81,7 @@ def inwards(work, tree):
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
     zero = splat(work, 0.0)
-    for index in range(tree.entries):
+    for index in range(len(tree.path)):
         store(work, packed + index, 0.0)
     for index in range(bodies * INERTIA):
         store(work, inertias + index, load(work, tree.own + index))
