@@ -367,7 +367,7 @@ class RunStatistics(lanes.Statistics):
 
     def add(self, first: int, rows: Array) -> None:
         """Add steps from step `first` on; `rows` (steps, width, LANES) has q, nu, u and more."""
-        take = kernel("loop", "take", "the run statistics")
+        take = kernel("loop", "take")
         take(self._words, rows.reshape(-1, LANES), first, len(rows))
         sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
         self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]

@@ -108,7 +108,7 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
             words += of_inner.tolist()
             fresh += new
         elif of.axes:
-            array = np.require(part, of.dtype, ("C", "W"))
+            array = np.ascontiguousarray(part, of.dtype)
             if of == LANED:
                 column, array = array.reshape(-1, 1).copy(), work_space(len(array))
                 array[:] = column

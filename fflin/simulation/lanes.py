@@ -142,7 +142,7 @@ class LaneLoop:
         # `_fresh` has pairs of an array with one column per lane and the column of initial values.
         self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.tree.size)
-        self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
+        self._advance = kernel("loop", "advance")
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width, self.done = int(self.ends[-1]), 0
@@ -440,9 +440,8 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     """Return the allocation from the commands of `asking` to the inputs of `giving`."""
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
-    point = empty(forward.POINT)._replace(
-        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
-    )
+    inputs = max(len(robot.actuation.names) for robot in (asking, plant))
+    point = empty(forward.POINT)._replace(q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs))
     return allocation.Allocation(
         asking=asks,
         giving=giving,

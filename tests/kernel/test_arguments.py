@@ -93,9 +93,8 @@ def test_arrays_are_converted_to_their_kind_or_refused():
         value, words, _ = laid_out(VALUE._replace(reals=reals), OUTER)
         assert value.reals.dtype == float and value.reals.flags.c_contiguous
         assert value.reals.tolist() == [0.5, 2.0] and words[2] == value.reals.ctypes.data
-    for wrong in (np.zeros((2, 1)), 0.5):
-        with pytest.raises(AssertionError):
-            laid_out(VALUE._replace(reals=wrong), OUTER)
+    with pytest.raises(AssertionError):
+        laid_out(VALUE._replace(reals=np.zeros((2, 1))), OUTER)
 
 
 def test_an_empty_value_has_all_fields():
