@@ -413,10 +413,10 @@ def _filtered(
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
-    samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
-    _, charts, near = zip(*samples, strict=True)
-    nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by, *_ in samples]
+    starts = [k * times.sample * times.dt for k in range(rows)]
+    _, measures, near = zip(*map(loop.at, starts), strict=True)
+    nz, stages = len(loop.estimate), 1 if times.sample else 1 + len(plan.method.nodes)
+    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(policy.terms, starts)]
     compensator = {
         key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
     }
@@ -426,7 +426,7 @@ def _filtered(
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for chart in charts]),
+        origin=np.concatenate([pin.SE3ToXYZQUAT(each.state.origin) for each in measures]),
         near=np.concatenate([x[state.groups.q_m] for x in near]),
         filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=measured,
