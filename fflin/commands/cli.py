@@ -7,10 +7,9 @@ import io
 import json
 import math
 import os
-import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +21,6 @@ from fflin.base.errors import FflinError, FflinWarning, FileError
 from fflin.base.tables import first_paragraph, headed
 from fflin.base.writing import check_ending, check_output_path, files_of_command, followed_path
 from fflin.commands import BAD_INPUT, DONE, parser
-from fflin.commands.options import COMMON, OPTIONS, OUTPUT, SPECIAL
 
 if TYPE_CHECKING:
     from fflin.commands.builders import Report
@@ -138,39 +136,11 @@ def _parser(asked: str) -> parser.Command:
         group = main.add_argument_group(task)
         for name in names if not known else {asked} & {*names}:
             module = "control" if name in _CONTROL else "models"
-            add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
+            parser.add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
         # argparse puts all commands in one group; move them to the group of their task.
         group._group_actions += commands._choices_actions
         commands._choices_actions = []
     return main
-
-
-def add_command(
-    commands: argparse._SubParsersAction[parser.Command],
-    run: Callable[[argparse.Namespace], Report],
-) -> None:
-    """Add a command and its options. The function `run` executes the command and gives its name.
-
-    The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
-    the options in `COMMON`; ``--help all`` lists all options.
-    """
-    name, (summary, _, example) = run.__name__, (run.__doc__ or "").partition("\n\n")
-    command = commands.add_parser(
-        name,
-        add_help=False,
-        help=summary[:1].lower() + summary[1:].removesuffix("."),
-        description=summary,
-        epilog=example,
-    )
-    # A negative number such as -1e-3 is a value, not an option.
-    command._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-    about = "show help for the common options; --help all shows help for all options"
-    command.add_argument("-h", "--help", nargs="?", metavar="all", action=parser.Help, help=about)
-    command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
-    forms = {**parser.FORMS, **SPECIAL.get(name, {})}
-    command.add(OUTPUT, {"json": "print the results as one JSON object"}, forms)
-    for title, options in OPTIONS[name].items():
-        command.add(title, options, forms)
 
 
 def finish(report: Report, arguments: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.state import Actuation, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
 from fflin.linear.model import ControlSystem, LinearModel, state_space
 
@@ -232,9 +232,8 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
 
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
-    for kind, there in (("state", state), ("input", Actuation(state))):
-        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
-        require_same(made, robot, kind, own, (there.names, there.units))
+    require_same(made, state, "state", gain.state_names, gain.state_units)
+    require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 

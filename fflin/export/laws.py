@@ -19,7 +19,7 @@ from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.linear.fit import Signals, sensed
+from fflin.linear.fit import Signals, signals_of
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.loading import load
@@ -243,14 +243,14 @@ def _output_law(
     given: LinearController | Compensator, lin: LinearModel | None, robot: Robot, limits: object
 ) -> Law:
     if isinstance(given, LinearController):
-        terms, lin = given.terms, given.lin
+        terms, lin = given.terms(), given.lin
         inputs = lin.input_names, lin.input_units
         signals = lin.output_names, lin.output_units
     else:
         none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
-        actuation, (names, units) = Actuation(state), sensed(state)
-        known = dict(zip(names + actuation.names, units + actuation.units, strict=True))
+        sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
+        known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
         inputs, signals = (
             (names, tuple(known.get(name, "unknown") for name in names))
             for names in (given.output_names, given.input_names)

@@ -284,7 +284,7 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            by, model = policy.terms, lin
+            by, model = policy.terms(), lin
             z: Array = np.zeros(len(by.A))
 
             def command(e: Array) -> Array:
