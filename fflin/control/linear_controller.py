@@ -21,7 +21,7 @@ from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
-from fflin.linear.fit import require_sensed
+from fflin.linear.fit import about_point, require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -123,12 +123,9 @@ class LinearController(Feedback):
     noise: Callable[[float], ArrayLike] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError(
-                f"sign is {self.sign!r} and lin.moving is {lin.moving}, expected sign 1 or -1 and "
-                "a model about a fixed point, with moving False"
-            )
+        lin = about_point(self.lin)
+        if number("sign", self.sign) not in (1.0, -1.0):
+            raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _system_of(self.system)

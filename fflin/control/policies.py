@@ -17,7 +17,7 @@ from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
-from fflin.linear.fit import require_fit, require_turns
+from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
@@ -92,14 +92,8 @@ class StateFeedback(Feedback):
     K: Array
 
     def __post_init__(self) -> None:
-        instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if self.lin.moving:
-            raise InputError(
-                "the model is about a moving reference, expected one about a fixed point; follow "
-                "a moving reference with TrajectoryFeedback"
-            )
         hint = " (nu, nx); give the gain that was designed for this model"
-        self.K = frozen(shaped("K", self.K, self.lin.B.shape[::-1], hint))
+        self.K = frozen(shaped("K", self.K, about_point(self.lin).B.shape[::-1], hint))
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
