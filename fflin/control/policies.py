@@ -25,6 +25,9 @@ from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
+# Function of time that returns measurement noise (ny,).
+Noise: TypeAlias = Callable[[float], ArrayLike]
+
 # Function of t, q and v that returns the inputs u* of a reference, and the error e relative to it.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
 
@@ -241,6 +244,10 @@ Measure: TypeAlias = Callable[[Array], Array]
 # Function of a controller's state z that returns the command, and the next z or dz/dt.
 Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
 
+# Function of time that returns a compensator's step, the robot's outputs, and the state near which
+# angles are unwrapped.
+At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
+
 
 class Sample(NamedTuple):
     """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
@@ -269,18 +276,12 @@ class Sample(NamedTuple):
 class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
-    The compensator's state z advances at each sample, or at each stage if dt is 0. ``at(t)``
-    returns the compensator's step, the robot's outputs, and the state near which angles are
-    unwrapped. `sizes` are the sizes of z and y.
+    The compensator's state z advances at each sample, or at each stage if dt is 0. `sizes` are the
+    sizes of z and y.
     """
 
     def __init__(
-        self,
-        state: StateMap,
-        dt: float,
-        sizes: tuple[int, int],
-        at: Callable[[float], tuple[Step, Measuring, Array]],
-        noise: Callable[[float], ArrayLike] | None = None,
+        self, state: StateMap, dt: float, sizes: tuple[int, int], at: At, noise: Noise | None = None
     ) -> None:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
