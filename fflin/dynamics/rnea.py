@@ -53,10 +53,8 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides: list[int] = []
-        for joint in robot.joints:
-            if joint.prismatic and joint.kind != "modal":
-                self._slides.append(joint.idx_q)
+        slides = [joint for joint in robot.joints if joint.prismatic and joint.kind != "modal"]
+        self._slides = [joint.idx_q for joint in slides]
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -210,9 +208,7 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored: list[tuple[int, Array]] = []
-        for mounted, momentum in robot.stored_momentum:
-            self._stored.append((mounted, skew(momentum)))
+        self._stored = [(mounted, skew(momentum)) for mounted, momentum in robot.stored_momentum]
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
@@ -238,8 +234,7 @@ class Accelerations:
         v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
-            pull = tide.force(model, data, q_still)
-            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
+            pull, pull_by_q, pull_by_turn = tide.force(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
         self._inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)

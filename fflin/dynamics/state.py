@@ -240,9 +240,7 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
-        in_frame = nu
-        if not chart.standing:
-            in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:

@@ -186,19 +186,10 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-LAW = Struct(
-    Law,
-    REALS,
-    {LANED: "x y added u"},
-    kind=WHOLE,
-    turned=FLAGS,
-    grid=Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED),
-    filter=Struct(Filter, z=LANED, rates=LANED),
-    measured=INDICES,
-    gyros=INDICES,
-    path=PATH,
-    allocation=ALLOCATION,
-)
+GRID = Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED)
+FILTER = Struct(Filter, z=LANED, rates=LANED)
+_OF_LAW = {WHOLE: "kind", FLAGS: "turned", INDICES: "measured gyros", LANED: "x y added u"}
+LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocation=ALLOCATION)
 
 
 @called
