@@ -194,7 +194,7 @@ class Accelerations:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
         self._model, self._nv = robot.model, 6 + robot.n
-        self._inertia = Inertia(state, data)
+        self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
         # Derivatives of M a + b - B u - springs over the displacements of the state. They are
@@ -212,10 +212,6 @@ class Accelerations:
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
-    def invert(self, q: Array, out: Array) -> None:
-        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
-        self._inertia.invert(q, out, quick=True)
-
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:
@@ -230,13 +226,13 @@ class Accelerations:
         # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
         # is left out as well, because it accelerates all parts of the robot alike (equivalence
         # principle).
-        q_still, v_still = self._inertia.centred(q), self._still
+        q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
             pull, pull_by_q, pull_by_turn = tide.force(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
-        self._inertia.invert(q_still, inverse, quick=not self._resists)
+        self.inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         wrenches = actuation.wrenches(u)

@@ -389,10 +389,9 @@ class Actuation:
         for item, own in kinds.named_inputs(robot.inputs):
             at, unit = len(columns), item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
-                torque = isinstance(item, kinds.BaseTorque)
-                rows = ANGULAR if torque else LINEAR
+                rows = ANGULAR if isinstance(item, kinds.BaseTorque) else LINEAR
                 columns += list(identity[rows])
-                if state.axes[0 if torque else 1]:
+                if rows in state.in_reference:
                     held.append(slice(at, at + 3))
             elif isinstance(item, kinds.JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
@@ -417,9 +416,8 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups: dict[str, Indices] = {}
-        for group in dict.fromkeys(groups):
-            self.groups[group] = np.flatnonzero(np.array(groups) == group)
+        kind = np.array(groups)
+        self.groups = {group: np.flatnonzero(kind == group) for group in dict.fromkeys(groups)}
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose
