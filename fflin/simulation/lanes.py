@@ -149,11 +149,8 @@ class LaneLoop:
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width, self.done = int(self.ends[-1]), 0
-        self._of_run = {
-            **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
-            **robot.tree._asdict(),
-            **robot.faults._asdict(),
-        }
+        self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
+        self._of_run |= robot.tree._asdict() | robot.faults._asdict()
 
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
@@ -354,7 +351,6 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
     return law._replace(
-        kind=policies.NOTHING,
         turned=list(state.axes),
         origin=pin.SE3ToXYZQUAT(state.origin),
         near=np.zeros(state.robot.n),

@@ -335,11 +335,9 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 def _part_of(sample: float, largest: float, *times: float) -> float:
     """Return a time step that divides the sample time and, if possible, all other times."""
     least = int(np.ceil(sample / largest))
-    for parts in range(least, least + 1000):
-        dt = sample / parts
-        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
-            return dt
-    return sample / least
+    steps = [sample / parts for parts in range(least, least + 1000)]
+    fit = (dt for dt in steps if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times))
+    return next(fit, steps[0])
 
 
 def _positive(name: str, value: object) -> float:
