@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
 from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
@@ -363,10 +363,8 @@ def _read(path: Path) -> System:
             "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
-    try:
+    with located(str(path)):
         return _checked(A, B, C, D, dt, inputs, outputs)
-    except FflinError as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def _indices(

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import pinocchio as pin
 
+from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
@@ -53,9 +54,9 @@ class Feedback:
     def deviation(self, robot: Robot) -> Deviation:
         """Return a function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
-        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
-        near[fed] = lin.x0
-        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
+        S = selection(lin.state_names, state.names)
+        near = S.T @ lin.x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
 
 
 @dataclass(eq=False)
@@ -102,13 +103,8 @@ class StateFeedback(Feedback):
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin = self.lin
-        fed = np.array([state.names.index(name) for name in lin.state_names])
-        near = np.zeros(state.nx)
-        near[fed] = lin.x0
-        K = np.zeros((len(self.K), state.nx))
-        K[:, fed] = self.K
-        return K, lin.u0 + self.K @ lin.x0, near
+        lin, S = self.lin, selection(self.lin.state_names, state.names)
+        return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -152,11 +148,6 @@ class Allocation:
 
     policy: object
     design: Robot
-
-    @property
-    def lin(self) -> LinearModel | None:
-        """Linear model that the policy was designed for, or None if the policy has none."""
-        return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -371,8 +362,9 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model and the gain K of a policy; each is None if the policy has none."""
-    lin = getattr(policy, "lin", None)
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
+    by = decider(policy)
+    lin = getattr(by, "lin", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:

@@ -56,11 +56,10 @@ class Law:
     state: StateMap | None  # None for an output law
     signals: Signals  # names and units of the states or outputs
     inputs: Signals
-    continuous: list[bool]  # whether each joint or output is the angle of a continuous joint
     dt: float
     robot: Robot
     lin: LinearModel | None
-    tables: dict[str, Array]  # as in the C code, with u0, low and high for all laws
+    tables: dict[str, Array]  # as in the C code; u0, low, high and continuous for all laws
     operations: float  # bound on the number of rounded operations between an argument and a result
     cases: list[Case]
 
@@ -125,6 +124,7 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
     tables |= _limits(robot, limits, actuation.names)
     cases = list(_state_cases(state, bound(given, robot), dt, tables, axes))
     tables["in_reference_axes"] = np.array(state.axes)
+    tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
     if axes:
         sizes = [*map(len, axes.values())]
         tables["axis_joint"] = np.array([*map(robot.joint_names.index, axes)])
@@ -137,7 +137,6 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
         state=state,
         signals=(state.names, state.units),
         inputs=(actuation.names, actuation.units),
-        continuous=[joint.unbounded for joint in robot.joints],
         dt=dt,
         robot=robot,
         lin=lin,
@@ -261,18 +260,18 @@ def _output_law(
             "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
     angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
-    continuous = [name in angles for name in signals[0]]
+    continuous = np.array([name in angles for name in signals[0]])
     tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")}
+    tables |= {"u0": terms.u0[None], "continuous": continuous}
     return Law(
         title=type(given).__name__,
         state=None,
         signals=signals,
         inputs=inputs,
-        continuous=continuous,
         dt=given.dt,
         robot=robot,
         lin=lin,
-        tables={**tables, "u0": terms.u0[None], **_limits(robot, limits, inputs[0])},
+        tables=tables | _limits(robot, limits, inputs[0]),
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
     )
