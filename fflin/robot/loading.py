@@ -103,11 +103,7 @@ def load(
     >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
     8
     """
-    found, dirs, locks = (
-        find_robot(robot),
-        folders(package_dirs),
-        requested(() if lock is None else lock),
-    )
+    found, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
     document, later, of_file = None, dict[str, float | None](), dict[str, object]()
     if found.path.suffix.lower() == ".toml":
         document, found, own, of_file = _read_robot_file(found)
@@ -203,7 +199,7 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     _check_model(copy, name)
-    robot = _robot(copy, name, requested(() if lock is None else lock), {})
+    robot = _robot(copy, name, requested(lock), {})
     return robot.replace(**fields) if fields else robot
 
 
