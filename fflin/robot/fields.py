@@ -206,7 +206,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
     """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
-    low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
+    low, high = np.array([limits.get(name, _OPEN) for name in inputs]).T
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
     for index, (_, item) in pulsed_thrusters(robot).items():
         high[index] = min(high[index], item.max or math.inf)
