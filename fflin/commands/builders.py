@@ -274,7 +274,7 @@ def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
     """Return the regulator of a model with the weights of the options; warn of small margins."""
-    from fflin.control.gain import fragility, one_sided
+    from fflin.control.gain import cautions
     from fflin.control.lqr import require_fixed_point
     from fflin.control.weights import rule_weights
 
@@ -288,7 +288,7 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
         hint = "; --no-allocate weights single thrusters" * allocated
         raise UnknownNameError(f"{error}{hint}") from None
     gain = replace(fflin.lqr(lin, *QRN, wheel_speeds=speeds), weights=rule)
-    for text in filter(None, (fragility(gain), one_sided(gain))):
+    for text in cautions(gain):
         warnings.warn(text, FflinWarning, stacklevel=2)
     return gain
 

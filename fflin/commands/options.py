@@ -302,6 +302,8 @@ ABOUT: dict[str, str] = {
     "wide. CONDITION defines success, such as 'attitude < 1 deg'",
     "width": "width of the confidence interval at which --until stops the runs",
     "worst": "list the K worst runs",
+    "force": "replace the file of -o, whatever it contains. Without --force, -o replaces only a "
+    "file that contains a result of the same kind",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "

@@ -78,9 +78,7 @@ class OutputFile:
 
 def assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE."""
-    name, separator, value = text.rpartition("=")
-    if not separator or not name:
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form NAME=VALUE")
+    name, (value,) = _parts(text, "NAME=VALUE", 1)
     return name, number(value)
 
 
@@ -104,21 +102,17 @@ def orbit(text: str) -> dict[str, float | str]:
 
 def parameter_range(text: str) -> tuple[str, object]:
     """Read NAME=FRACTION or NAME=LEAST:LARGEST, either of which may end with ",tied"."""
-    name, _, value = text.rpartition("=")
-    tied = value.endswith(",tied")
-    ends = value.removesuffix(",tied").split(":")
-    if not name or len(ends) > 2:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is not of the form NAME=FRACTION or NAME=LEAST:LARGEST"
-        )
+    name, ends = _parts(text, "NAME=FRACTION or NAME=LEAST:LARGEST", 1, 2)
+    tied = ends[-1].endswith(",tied")
+    ends[-1] = ends[-1].removesuffix(",tied")
     found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
     return name, {"range": found, "tied": True} if tied else found
 
 
 def grid_axis(text: str) -> tuple[str, tuple[float, float, int]]:
     """Read JOINT=LO:HI:N."""
-    name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
-    low, high, count = *map(number, parts[:2]), count_of(parts[2])
+    name, (*ends, points) = _parts(text, "JOINT=LO:HI:N, such as joint_1=-1:1:21", 3)
+    low, high, count = *map(number, ends), count_of(points)
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)
@@ -126,16 +120,16 @@ def grid_axis(text: str) -> tuple[str, tuple[float, float, int]]:
 
 def joint_range(text: str) -> tuple[str, tuple[float, float]]:
     """Read JOINT=LO:HI."""
-    name, (low, high) = _parts(text, "JOINT=LO:HI", "joint_1=-1:1")
+    name, (low, high) = _parts(text, "JOINT=LO:HI, such as joint_1=-1:1", 2)
     return name, (number(low), number(high))
 
 
-def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values; their number must be as in `form`."""
+def _parts(text: str, form: str, *counts: int) -> tuple[str, list[str]]:
+    """Split NAME=A:B:... into the name and its values; their number must be one of `counts`."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
-    if not name or len(parts) != len(form.split(":")):
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form {form}, such as {example}")
+    if not name or len(parts) not in counts:
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form {form}")
     return name, parts
 
 
@@ -246,10 +240,6 @@ FORMS: dict[str, Form] = {
 }
 
 _REPEATABLE = " (repeatable)"
-_FORCE = (
-    "replace the file of -o, whatever it contains. Without --force, -o replaces only a file that "
-    "contains a result of the same kind"
-)
 
 
 class Command(argparse.ArgumentParser):
@@ -308,7 +298,7 @@ def add_command(
                 flags.insert(0, "-o")
             group.add_argument(*flags, help=text, **form)
             if isinstance(reader, OutputFile) and reader.kinds:
-                group.add_argument("--force", help=_FORCE, action="store_true")
+                group.add_argument("--force", help=ABOUT["force"], action="store_true")
 
 
 def print_error(line: str) -> None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
 from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
@@ -90,6 +90,8 @@ class LinearController(Feedback):
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
         The controller from all outputs to all inputs of the model, with `sign` applied.
+    dt : float
+        Sampling time [s]; 0 in continuous time.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -152,17 +154,13 @@ class LinearController(Feedback):
                 "the model, or give the continuous model"
             )
         self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
+        self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
         time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
         return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
-        return float(self.system.dt)
 
     def terms(self, _: float = 0.0) -> Sample:
         """Return the matrices and offsets, which are the same at all times."""
@@ -363,10 +361,8 @@ def _read(path: Path) -> System:
             "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
-    try:
+    with located(str(path)):
         return _checked(A, B, C, D, dt, inputs, outputs)
-    except FflinError as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def _indices(

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import pinocchio as pin
 
+from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
@@ -53,9 +54,9 @@ class Feedback:
     def deviation(self, robot: Robot) -> Deviation:
         """Return a function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
-        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
-        near[fed] = lin.x0
-        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
+        S = selection(lin.state_names, state.names)
+        near = S.T @ lin.x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
 
 
 @dataclass(eq=False)
@@ -102,13 +103,8 @@ class StateFeedback(Feedback):
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin = self.lin
-        fed = np.array([state.names.index(name) for name in lin.state_names])
-        near = np.zeros(state.nx)
-        near[fed] = lin.x0
-        K = np.zeros((len(self.K), state.nx))
-        K[:, fed] = self.K
-        return K, lin.u0 + self.K @ lin.x0, near
+        lin, S = self.lin, selection(self.lin.state_names, state.names)
+        return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -153,11 +149,6 @@ class Allocation:
     policy: object
     design: Robot
 
-    @property
-    def lin(self) -> LinearModel | None:
-        """Linear model that the policy was designed for, or None if the policy has none."""
-        return getattr(self.policy, "lin", None)
-
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -181,10 +172,10 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        self._states = [
-            StateMap(each, reference=reference, frame=frame) for each in (allocation.design, robot)
-        ]
-        self._design, self._robot = map(Actuation, self._states)
+        self._design, self._robot = (
+            Actuation(StateMap(each, reference=reference, frame=frame))
+            for each in (allocation.design, robot)
+        )
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
@@ -206,14 +197,12 @@ class AllocatedPolicy:
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
-        asked, given = self._states
-        u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
+        state = self._design.state
+        chart = state.chart(q)
+        u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
-        columns = self._robot.columns(self._data, q)
-        for held in self._robot.held:
-            columns = columns.copy()
-            columns[:, held] = columns[:, held] @ given.chart(q).R.T
-        M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
+        columns = chart.to_reference(self._robot.held, self._robot.columns(self._data, q).T).T
+        M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
         return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
@@ -371,8 +360,9 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model and the gain K of a policy; each is None if the policy has none."""
-    lin = getattr(policy, "lin", None)
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
+    by = decider(policy)
+    lin = getattr(by, "lin", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:

@@ -256,11 +256,9 @@ class CLaw:
             return Loop(state, self.dt, sizes, lambda t: (partial(step, t), *there))
         world, n = StateMap(robot, frame=state.frame), robot.n
         # C has no empty arrays, so an array for joints has at least one entry.
-        given, u = (
-            np.zeros(13 + 2 * max(n, 1), self._real),
-            np.zeros(len(self._about["u0"]), self._real),
-        )
-        at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
+        room = max(n, 1)
+        given, u = (np.zeros(size, self._real) for size in (13 + 2 * room, len(self._about["u0"])))
+        at = [*range(7 + n), *range(7 + room, 13 + n + room)]
         samples = self._about["kind"] == "samples"
 
         def policy(t: float, q: Array, v: Array) -> Array:
@@ -343,7 +341,6 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     words: dict[str, object] = {
         **(_DOUBLE if real == "double" else _FLOAT),
         **{key: array(table) for key, table in tables.items()},
-        "continuous": array(np.array(law.continuous, dtype=bool)),
         **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
         **{"law": law.title, "frame": frame or "not known", "robot": _plain(robot.name)},
         "sha256": robot.urdf_sha256 or "not known",
