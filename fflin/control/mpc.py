@@ -474,13 +474,13 @@ class Receding:
         if flag <= 0:  # solve again without a warm start
             self._start()
             z, flag = self._solved(free)
-        if flag > 0:
-            d += now.L @ z[: len(d)]
         if flag == _SOFTENED:
             reached = free + self._G @ z
             excess = np.maximum(self._low - reached, reached - self._high)
             self._record(_OF_PLANS, t, excess, self._unit, _VIOLATED * self._size)
-        if flag <= 0:
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+        else:
             self.unfinished += 1
             if self.unfinished == 1:
                 warnings.warn(

@@ -150,15 +150,14 @@ def require_semidefinite(
 
 def cost_weights(
     of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
-) -> tuple[Array, Array, Array | None]:
-    """Return the checked weights as matrices."""
+) -> tuple[Array, Array, Array]:
+    """Return the checked weights as matrices; N is zero by default."""
     Q = weight("Q", Q, of.state_names)
     R = weight("R", R, input_keys(of), definite=True)
-    if N is None:
-        return Q, R, None
-    cross = shaped("N", N, (len(Q), len(R)))
-    reduced = Q - cross @ np.linalg.solve(R, cross.T)
-    require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
+    cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
+    if cross.any():
+        reduced = Q - cross @ np.linalg.solve(R, cross.T)
+        require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
     return Q, R, cross
 
 
@@ -226,7 +225,7 @@ def sampled_cost(
         )
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
-    nx, cross = len(Q), np.zeros(lin.B.shape) if cross is None else cross
+    nx = len(Q)
     W = np.block([[Q, cross], [cross.T, R]])
     F = np.zeros_like(W)
     F[:nx] = np.hstack((lin.A, lin.B))
