@@ -267,7 +267,8 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            by, model, z = policy.terms(), lin, np.zeros(len(policy.system.A))
+            by, model = policy.terms(), lin
+            z: Array = np.zeros(len(by.A))
 
             def command(e: Array) -> Array:
                 nonlocal z
