@@ -448,15 +448,13 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
 def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
     """Raise an error for invalid options of `pictures`, before a long simulation starts."""
     from fflin.simulation.plan import LONGEST
-    from fflin.view.visualize import check_outputs, check_rates, check_times, tool_frame
+    from fflin.view.visualize import check_outputs, check_playback, tool_frame
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
     tool_frame(robot, arguments.tool)
     duration = arguments.duration or LONGEST
-    check_rates(arguments.fps, arguments.speed, duration)
-    if arguments.times:
-        check_times(arguments.times, 0.0, duration)
+    check_playback(arguments.fps, arguments.speed, arguments.times, 0.0, duration)
 
 
 def pictures(

@@ -135,7 +135,7 @@ def lqr(
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
         S = selection(part.state_names, lin.state_names)
-        Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
+        Q, cross = S @ Q @ S.T, S @ cross
     solution = _solve(part, Q, R, cross)
     return make_gain(lin, part, solution, Q, R, cross, rule)
 
@@ -241,7 +241,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
         )
     R = L.T @ (ra[:, None] * L)
     found = solved(P, K, poles, residual, "closed form")
-    return make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, None)
+    return make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, np.zeros_like(lin.B))
 
 
 def _diagonal(
@@ -284,17 +284,14 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
     return np.where(np.abs(difference) > rounding, difference, 0.0)
 
 
-def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Solution:
+def _solve(lin: LinearModel, Q: Array, R: Array, N: Array) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None:
         return structured
     # If a mode would make a general solver fail, these checks raise an error that names the mode.
     require_stabilizable(lin)
-    free, A = Q, lin.A
-    if N is not None:
-        toward = np.linalg.solve(R, N.T)
-        free, A = _difference(Q, N, toward), _difference(A, lin.B, toward)
-    require_weighed(lin, A, free)
+    toward = np.linalg.solve(R, N.T)
+    require_weighed(lin, _difference(lin.A, lin.B, toward), _difference(Q, N, toward))
     try:
         solution = solve(lin.A, lin.B, Q, R, N, lin.dt)
         if solution.residual > _USELESS:

@@ -381,11 +381,6 @@ class Horizon:
     low: Array
     high: Array
 
-    @property
-    def acting(self) -> Indices:
-        """Indices of the inputs that have limits."""
-        return self.at[self.at < len(self.inputs)]
-
     def stage(
         self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
     ) -> Stage:
@@ -408,7 +403,7 @@ class Horizon:
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
         """Return the lower and upper limits (m,) of stages, and a mask of the soft limits."""
-        soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
+        soft = np.tile(self.at >= len(self.inputs), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
 
@@ -456,11 +451,11 @@ class Receding:
 
     def step(self, t: float, e: Array) -> Array:
         """Return the command minus the reference inputs (nu,), for the error e (nx,)."""
-        stages, acting = self.of.window(t), self.of.acting
+        stages = self.of.window(t)
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
             return d
-        if not self._stages or stages[0] is not self._stages[0]:
+        if stages[0] is not self._stages[0]:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
@@ -474,13 +469,13 @@ class Receding:
         if flag <= 0:  # solve again without a warm start
             self._start()
             z, flag = self._solved(free)
-        if flag > 0:
-            d += now.L @ z[: len(d)]
         if flag == _SOFTENED:
             reached = free + self._G @ z
             excess = np.maximum(self._low - reached, reached - self._high)
             self._record(_OF_PLANS, t, excess, self._unit, _VIOLATED * self._size)
-        if flag <= 0:
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+        else:
             self.unfinished += 1
             if self.unfinished == 1:
                 warnings.warn(
@@ -490,7 +485,8 @@ class Receding:
                     FflinWarning,
                     2,
                 )
-        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        hard = self.of.at[self.of.at < len(d)]  # the inputs with limits; their rows come first
+        d[hard] = np.clip(d[hard], now.low[: len(hard)], now.high[: len(hard)])
         self._due = now, d
         return d
 

@@ -56,7 +56,8 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     nx, nu = lin.B.shape
     cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
     size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
-    with drawing(path, *size, compressed=True) as figure:
+    with drawing(path, *size) as figure:
+        figure.set_layout_engine("compressed")
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})

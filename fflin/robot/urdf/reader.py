@@ -86,9 +86,8 @@ def describe(document: bytes, path: Path) -> Urdf:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
-    moving = [joint for joint in joints.values() if joint.freedom]
-    names = {"universe", root_joint, *(joint.name for joint in moving)}
-    if set(model.names) != names or len(names) != 2 + len(moving):
+    moving = [joint.name for joint in joints.values() if joint.freedom]
+    if sorted(model.names) != sorted(["universe", root_joint, *moving]):
         raise UrdfError(
             f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
             "joints with unusual names"
