@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -25,9 +25,6 @@ from fflin.robot.robot import Robot
 
 # A time up to this factor times the end counts as the end, because sums of time steps are rounded.
 AT_THE_END = 1.0 + 1e-9
-
-# Function that returns q, v and u, in the policy's axes, at a time of the run.
-Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 
 @dataclass(eq=False)
@@ -217,12 +214,6 @@ def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
     if held and isinstance(policy, LinearController):
         return policy.sampled(held)
     return policy
-
-
-def reference_of(policy: object) -> Reference | None:
-    """Return the reference of a policy that follows a motion, or None."""
-    found = getattr(decider(policy), "reference", None)
-    return found if callable(found) else None
 
 
 def tracking_of(policy: object) -> TrajectoryFeedback | None:
