@@ -86,10 +86,7 @@ class TrajectoryFeedback(Feedback):
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return the reference q, v, and u in base axes at time t of the run."""
-        return self._point(t, self.duration * AT_THE_END)
-
-    def _point(self, t: float, over: float) -> tuple[Array, Array, Array]:
-        if t > over:
+        if t > self.duration * AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         first, last = self.trajectory.t[[0, -1]].tolist()
         return self.trajectory.point(min(first + max(t, 0.0), last))
@@ -112,9 +109,11 @@ class TrajectoryFeedback(Feedback):
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, u of the trajectory point to which the command at run time t refers."""
-        q, v, u = self._point(t, self.over)
-        if self.ahead and t <= self.over:
-            u = self._point(min(t + self.ahead, self.duration), self.duration)[2]
+        if t > self.over:
+            return self.reference(np.inf)
+        q, v, u = self.reference(t)
+        if self.ahead:
+            u = self.reference(min(t + self.ahead, self.duration))[2]
         return q, v, u
 
     @cached_property
