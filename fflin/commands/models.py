@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import textwrap
 import warnings
 from argparse import Namespace
@@ -14,9 +15,11 @@ import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
 from fflin.base.names import runs
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals, width
-from fflin.base.writing import check_ending, check_output_path, write_atomically
+from fflin.base.writing import check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.points import (
+from fflin.commands.builders import (
+    SHOWN,
+    Report,
     linear_model,
     load_robot,
     models_along,
@@ -25,7 +28,6 @@ from fflin.commands.points import (
     refuse,
     state_of,
 )
-from fflin.commands.results import Report
 
 # Entries of f0 [SI] below this value count as zero.
 _MOVES = 1e-9
@@ -108,7 +110,6 @@ def init(arguments: Namespace) -> Report:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_output_path(target)
     if target.exists() and not arguments.force:
         raise FileError(
             f"{target} already exists; give another name with -o, or replace the file with --force"
@@ -128,22 +129,37 @@ def init(arguments: Namespace) -> Report:
     return Report(robot.name, {}, text, {target: None})
 
 
+def view(arguments: Namespace) -> Report:
+    """Show a robot live in the browser with a slider for each joint.
+
+    example: fflin view servicer_7dof --joint joint_2=0.4
+    """
+    from fflin.view.live import Live
+
+    robot = load_robot(arguments)
+    q, _ = state_of(robot, arguments, robot.point, robot.start)
+    how = {name: getattr(arguments, name) for name in (*SHOWN, "frame")}
+    live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
+    assert isinstance(live, Live)  # since there is no motion
+    print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    if not arguments.no_open:
+        live.open()
+    live.wait()
+    return Report(robot.name, {}, f"{robot.name}: the view is closed")
+
+
 def linearize(arguments: Namespace) -> Report:
     """Show or save the linear model A, B, C, D about an operating point.
 
     example: fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat
     """
     path, tool = arguments.output_file, getattr(arguments, "for")
-    if tool and arguments.trajectory:
-        raise InputError(
-            "--for converts the model about one operating point, but --trajectory defines many; "
-            "remove one of them"
-        )
     if tool and not path:
         raise InputError("--for saves the converted model; add -o FILE")
     if path and (tool or arguments.trajectory):
         check_ending(path, (".npz", ".mat", ".json"))
     if arguments.trajectory:
+        refuse(arguments, ("for",), "this option converts one model, but --trajectory gives many")
         refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")
         along = models_along(arguments)
         if arguments.dt is not None:
@@ -297,7 +313,7 @@ def equilibrium(arguments: Namespace) -> Report:
 
     refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
     robot = load_robot(arguments)
-    q, v, reference = point_of(robot, arguments, robot.point)
+    q, v, reference = point_of(robot, arguments)
     axes = {"frame": arguments.frame, "reference": reference}
     held = fflin.equilibrium(robot, q, v=v, **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
+from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
+from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
-from fflin.linear.fit import require_sensed
+from fflin.linear.fit import about_point, require_sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -90,6 +90,8 @@ class LinearController(Feedback):
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
         The controller from all outputs to all inputs of the model, with `sign` applied.
+    dt : float
+        Sampling time [s]; 0 in continuous time.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -118,15 +120,12 @@ class LinearController(Feedback):
     system: Any
     lin: LinearModel
     sign: float = field(default=1.0, kw_only=True)
-    noise: Callable[[float], ArrayLike] | None = field(default=None, kw_only=True)
+    noise: Noise | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError(
-                f"sign is {self.sign!r} and lin.moving is {lin.moving}, expected sign 1 or -1 and "
-                "a model about a fixed point, with moving False"
-            )
+        lin = about_point(self.lin)
+        if number("sign", self.sign) not in (1.0, -1.0):
+            raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _system_of(self.system)
@@ -152,6 +151,7 @@ class LinearController(Feedback):
                 "the model, or give the continuous model"
             )
         self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
+        self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
     def __repr__(self) -> str:
@@ -159,14 +159,8 @@ class LinearController(Feedback):
         time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
         return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
 
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
-        return float(self.system.dt)
-
-    @property
-    def terms(self) -> Sample:
-        """Matrices and offsets that apply at each sample or Runge-Kutta stage."""
+    def terms(self, _: float = 0.0) -> Sample:
+        """Return the matrices and offsets, which are the same at all times."""
         (A, B, C, D, *_), lin = self.system, self.lin
         return Sample(A, B, C, D, lin.u0, lin.y0)
 
@@ -178,15 +172,14 @@ class LinearController(Feedback):
         InputError
             If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
-        lin, stays = self.lin, self.terms
-        state = self.state_map(robot)
-        require_sensed(lin, robot, state)
-        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
-        return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
+        lin, terms, state = self.lin, self.terms(), self.state_map(robot)
+        require_sensed(lin, state)
+        always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
+        return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
         """Return the model with the controller's states added, and K and u of the law u + K e."""
-        A, B, C, D, u0, y0, *_ = self.terms
+        A, B, C, D, u0, y0, *_ = self.terms()
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
             lin,
@@ -272,10 +265,7 @@ class OutputFeedback(LinearController):
     """
 
     def __init__(
-        self,
-        lin: LinearModel,
-        compensator: Compensator,
-        noise: Callable[[float], ArrayLike] | None = None,
+        self, lin: LinearModel, compensator: Compensator, noise: Noise | None = None
     ) -> None:
         instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
         super().__init__(compensator, lin, noise=noise)
@@ -365,10 +355,8 @@ def _read(path: Path) -> System:
             "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
-    try:
+    with located(str(path)):
         return _checked(A, B, C, D, dt, inputs, outputs)
-    except FflinError as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def _indices(

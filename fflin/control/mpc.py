@@ -17,10 +17,10 @@ from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, num
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Clock, Deviation, Feedback, Policy, StateFeedback
+from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
-from fflin.control.weights import Weight, sampled_cost, weight
+from fflin.control.weights import Rule, Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
@@ -28,7 +28,7 @@ from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
 # Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
-Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
+Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST_ENTRIES = 20_000_000
@@ -60,7 +60,7 @@ def mpc(
     dt: float | None = None,
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
-    weights: str | None = None,
+    weights: Rule | None = None,
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
@@ -102,7 +102,7 @@ def mpc(
     Qf : "steady", or as Q
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
-    weights : {"urdf", "identity"}, optional
+    weights : {"urdf", "identity"} or mapping, optional
         Rule for the weights if Q and R are omitted, as in `lqr`.
 
     Returns
@@ -381,11 +381,6 @@ class Horizon:
     low: Array
     high: Array
 
-    @property
-    def acting(self) -> Indices:
-        """Indices of the inputs that have limits."""
-        return self.at[self.at < len(self.inputs)]
-
     def stage(
         self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
     ) -> Stage:
@@ -408,7 +403,7 @@ class Horizon:
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
         """Return the lower and upper limits (m,) of stages, and a mask of the soft limits."""
-        soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
+        soft = np.tile(self.at >= len(self.inputs), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
 
@@ -420,7 +415,7 @@ class Receding:
     """
 
     def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
-        self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
+        self.of, self._at, self._last = horizon, at, -np.inf
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.unfinished = 0
         # For each kind of soft-limit violation: the number of violations, and the magnitude and
@@ -448,7 +443,7 @@ class Receding:
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
-        self._clock.tick(t)
+        self._last = next_sample(t, self._last, self.of.dt)
         assert self._at is not None
         u, e = self._at(t, q, v)
         command: Array = u + self.step(t, e)
@@ -456,11 +451,11 @@ class Receding:
 
     def step(self, t: float, e: Array) -> Array:
         """Return the command minus the reference inputs (nu,), for the error e (nx,)."""
-        stages, acting = self.of.window(t), self.of.acting
+        stages = self.of.window(t)
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
             return d
-        if not self._stages or stages[0] is not self._stages[0]:
+        if stages[0] is not self._stages[0]:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
@@ -474,13 +469,13 @@ class Receding:
         if flag <= 0:  # solve again without a warm start
             self._start()
             z, flag = self._solved(free)
-        if flag > 0:
-            d += now.L @ z[: len(d)]
         if flag == _SOFTENED:
             reached = free + self._G @ z
             excess = np.maximum(self._low - reached, reached - self._high)
             self._record(_OF_PLANS, t, excess, self._unit, _VIOLATED * self._size)
-        if flag <= 0:
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+        else:
             self.unfinished += 1
             if self.unfinished == 1:
                 warnings.warn(
@@ -490,7 +485,8 @@ class Receding:
                     FflinWarning,
                     2,
                 )
-        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        hard = self.of.at[self.of.at < len(d)]  # the inputs with limits; their rows come first
+        d[hard] = np.clip(d[hard], now.low[: len(hard)], now.high[: len(hard)])
         self._due = now, d
         return d
 

@@ -144,16 +144,14 @@ def plan(
     low, high = input_limits(robot, acting)
     if (low > high).any():
         raise InputError("the lower limit of an input is above its upper limit; correct limits=")
-    if R is None:
-        size = np.maximum(np.abs(low), np.abs(high))
-        weights: Array = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
-    else:
-        matrix = weight("R", R, input_keys(actuation), definite=True)
-        weights = matrix.diagonal()
-        if (matrix != np.diag(weights)).any():
-            raise InputError(
-                "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
-            )
+    size = np.maximum(np.abs(low), np.abs(high))
+    by_limits = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
+    matrix = weight("R", by_limits if R is None else R, input_keys(actuation), definite=True)
+    weights = matrix.diagonal()
+    if (matrix != np.diag(weights)).any():
+        raise InputError(
+            "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
+        )
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
@@ -213,10 +211,8 @@ def _least(search: Search) -> _Made:
         if shooting.held:
             u = np.vstack((u[:-1], u[-2]))  # the last row repeats the input of the last interval
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
-        every = max(1, shooting.steps // _PARTS)
-        fine = shooting.motions(q, v, u, every * _PARTS)
-        points = (each[:, every::every] for each in fine[:2])
-        beyond = excess(bounds[:, None, None] - shooting.limited_values(*points))
+        within = shooting.inside(shooting.motions(q, v, u), _PARTS)
+        beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
         made = _Made(q, v, u, missed, at_knots, beyond, float(beyond.max()))

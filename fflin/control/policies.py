@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
@@ -16,13 +17,16 @@ from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
-from fflin.linear.fit import require_fit, require_turns
+from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+# Function of time that returns measurement noise (ny,).
+Noise: TypeAlias = Callable[[float], ArrayLike]
 
 # Function of t, q and v that returns the inputs u* of a reference, and the error e relative to it.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
@@ -53,9 +57,9 @@ class Feedback:
     def deviation(self, robot: Robot) -> Deviation:
         """Return a function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
-        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
-        near[fed] = lin.x0
-        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
+        S = selection(lin.state_names, state.names)
+        near = S.T @ lin.x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
 
 
 @dataclass(eq=False)
@@ -91,24 +95,13 @@ class StateFeedback(Feedback):
     K: Array
 
     def __post_init__(self) -> None:
-        instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if self.lin.moving:
-            raise InputError(
-                "the model is about a moving reference, expected one about a fixed point; follow "
-                "a moving reference with TrajectoryFeedback"
-            )
         hint = " (nu, nx); give the gain that was designed for this model"
-        self.K = frozen(shaped("K", self.K, self.lin.B.shape[::-1], hint))
+        self.K = frozen(shaped("K", self.K, about_point(self.lin).B.shape[::-1], hint))
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin = self.lin
-        fed = np.array([state.names.index(name) for name in lin.state_names])
-        near = np.zeros(state.nx)
-        near[fed] = lin.x0
-        K = np.zeros((len(self.K), state.nx))
-        K[:, fed] = self.K
-        return K, lin.u0 + self.K @ lin.x0, near
+        lin, S = self.lin, selection(self.lin.state_names, state.names)
+        return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -153,11 +146,6 @@ class Allocation:
     policy: object
     design: Robot
 
-    @property
-    def lin(self) -> LinearModel | None:
-        """Linear model that the policy was designed for, or None if the policy has none."""
-        return getattr(self.policy, "lin", None)
-
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -181,10 +169,10 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        self._states = [
-            StateMap(each, reference=reference, frame=frame) for each in (allocation.design, robot)
-        ]
-        self._design, self._robot = map(Actuation, self._states)
+        self._design, self._robot = (
+            Actuation(StateMap(each, reference=reference, frame=frame))
+            for each in (allocation.design, robot)
+        )
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
@@ -206,34 +194,29 @@ class AllocatedPolicy:
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
-        asked, given = self._states
-        u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
+        state = self._design.state
+        chart = state.chart(q)
+        u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
-        columns = self._robot.columns(self._data, q)
-        for held in self._robot.held:
-            columns = columns.copy()
-            columns[:, held] = columns[:, held] @ given.chart(q).R.T
-        M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
+        columns = chart.to_reference(self._robot.held, self._robot.columns(self._data, q).T).T
+        M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
         return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
 
 
-class Clock:
-    """Check that a controller with an internal state is called once per sample time `dt` [s]."""
+def next_sample(t: float, last: float, dt: float) -> float:
+    """Return t, or raise `InputError` unless t is one sample time `dt` [s] after the last sample.
 
-    def __init__(self, dt: float) -> None:
-        self._dt, self._last = dt, -np.inf
-
-    def tick(self, t: float) -> None:
-        """Raise `InputError` if t is not one sample time after the last sample."""
-        apart = t - self._last
-        if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
-            raise InputError(
-                f"the controller is called {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
-            )
-        self._last = t
+    `last` is negative before the first sample.
+    """
+    apart = t - last
+    if last >= 0.0 and abs(apart - dt) > 1e-6 * dt:
+        raise InputError(
+            f"the controller is called {apart:g} s after its last sample, expected "
+            f"{dt:g} s; leave out `sample`, or set `sample` to the expected value"
+        )
+    return t
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
@@ -255,6 +238,17 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
     return found, gyros
 
 
+# Function of the command u that returns the outputs y.
+Measure: TypeAlias = Callable[[Array], Array]
+
+# Function of a controller's state z that returns the command, and the next z or dz/dt.
+Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
+
+# Function of time that returns a compensator's step, the robot's outputs, and the state near which
+# angles are unwrapped.
+At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
+
+
 class Sample(NamedTuple):
     """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
 
@@ -270,8 +264,8 @@ class Sample(NamedTuple):
     y0: Array
     jump: Array | float = 0.0
 
-    def step(self, z: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
+    def step(self, z: Array, measure: Measure) -> tuple[Array, Array]:
+        """Return the command, and the next z or dz/dt."""
         z = z + self.jump
         u: Array = self.u0 + self.C @ z
         if self.D.any():  # acts on outputs that do not depend on u
@@ -282,48 +276,36 @@ class Sample(NamedTuple):
 class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
-    The compensator's state z advances at each sample, or at each stage if dt is 0.
+    The compensator's state z advances at each sample, or at each stage if dt is 0. `sizes` are the
+    sizes of z and y.
     """
 
     def __init__(
-        self,
-        state: StateMap,
-        dt: float,
-        noise: Callable[[float], ArrayLike] | None,
-        size: int,
-        at: Callable[[float], Any],
-        there: Callable[[float], tuple[Measuring, Array]],
+        self, state: StateMap, dt: float, sizes: tuple[int, int], at: At, noise: Noise | None = None
     ) -> None:
-        self.at, self.dt = at, dt
-        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
+        self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
+        self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
         self.rates: list[Array] = [self.estimate]
-        self.stages = 0
-        self._noise, self._there = noise, there
+        self.stages, self._last = 0, -np.inf
         self._at_rest: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
-
-    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return the law at time t, and the chart and state relative to which y is measured."""
-        measure, near = self._there(t)
-        return self.at(t), measure.state, near
+        self._aba = Aba(state) if felt else None
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or at a stage of the integrator."""
         if self.dt:
-            self._clock.tick(t)
+            self._last = next_sample(t, self._last, self.dt)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
                 "only fflin.simulate can integrate the states of a continuous controller; pass "
                 "the LinearController itself to fflin.simulate as the policy, or sample the "
                 "controller"
             )
-        measure, near = self._there(t)
+        step, measure, near = self.at(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
         noise: Array | float = 0.0
         if self._noise is not None:
-            size = len(self.at(t).y0)
-            noise = vector("noise(t)", self._noise(t), size, "one value for each output")
+            noise = vector("noise(t)", self._noise(t), self._ny, "one value for each output")
 
         def measured(u: Array) -> Array:
             a = self._at_rest
@@ -331,17 +313,12 @@ class Loop:
                 a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
             return np.asarray(measure(x, q, v, a) + noise)
 
-        u, after = self.step(t, measured)
+        u, after = step(self.estimate, measured)
         if self.dt:
             self.estimate = after
         else:
             self.rates.append(after)
         return u
-
-    def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
-        found: tuple[Array, Array] = self.at(t).step(self.estimate, measure)
-        return found
 
     def advance(self, weights: Array, last: bool) -> None:
         """Set z at the next stage to the weighted sum of the step's first z and its rates."""
@@ -378,8 +355,9 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model and the gain K of a policy; each is None if the policy has none."""
-    lin = getattr(policy, "lin", None)
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
+    by = decider(policy)
+    lin = getattr(by, "lin", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:

@@ -142,38 +142,28 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
 
 def held_derivatives(
     A: Array, driven: Array, h: float, dA: Array, d_driven: Array
-) -> tuple[Array, ...]:
-    """Return the derivatives of `held_exponential` along (dA, d_driven)."""
+) -> tuple[Array, Array]:
+    """Return the derivatives of `held_exponential` along dA (.., n, n) and d_driven (.., n, k)."""
+    # The derivative of x obeys d(dx)/dt = A dx + dA x + d_driven u, a linear system in (dx, x).
     n = len(A)
-    if not dA.any() and not (A @ A).any():
-        return np.zeros_like(A), d_driven * h + A @ d_driven * (h * h / 2.0)
-    from scipy.linalg import expm_frechet
-
-    block, along = np.zeros((2, n + driven.shape[1], n + driven.shape[1]))
-    block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
-    derivative = expm_frechet(block, along, compute_expm=False)
-    return derivative[:n, :n], derivative[:n, n:]
+    both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
+    both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
+    forced = np.concatenate((d_driven, np.broadcast_to(driven, d_driven.shape)), axis=-2)
+    exponential, held = held_exponential(both, forced, h)
+    return exponential[..., :n, n:], held[..., :n, :]
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     """Return the integral of e^(F' t) W e^(F t) over [0, h]; F and h may have leading axes."""
     # The rounding error of an exponential is relative to its largest block, so W is scaled to the
     # size of F.
-    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
-    if not (square @ F).any():
-        total = np.zeros(F.shape)
-        terms = (np.eye(n), F, 0.5 * square)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for i, left in enumerate(terms):
-                for j, right in enumerate(terms):
-                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
-            return 0.5 * (total + total.mT)
     from scipy.linalg import expm
 
-    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    h, n = np.asarray(h)[..., None, None], F.shape[-1]
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) or 1.0 for X in (F, W))
     doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
     block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
-    size = weight / rate or 1.0
+    size = weight / rate
     block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))

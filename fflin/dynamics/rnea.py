@@ -1,6 +1,7 @@
 """Inertia M and M^-1, accelerations, and their derivatives by RNEA."""
 
 import warnings
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -53,10 +54,7 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides: list[int] = []
-        for joint in robot.joints:
-            if joint.prismatic and joint.kind != "modal":
-                self._slides.append(joint.idx_q)
+        self._slides = [*map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))]
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -196,7 +194,7 @@ class Accelerations:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
         self._model, self._nv = robot.model, 6 + robot.n
-        self._inertia = Inertia(state, data)
+        self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
         # Derivatives of M a + b - B u - springs over the displacements of the state. They are
@@ -210,15 +208,9 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored: list[tuple[int, Array]] = []
-        for mounted, momentum in robot.stored_momentum:
-            self._stored.append((mounted, skew(momentum)))
+        self._stored = [(mounted, skew(momentum)) for mounted, momentum in robot.stored_momentum]
         self._field = state.field
         self._still = np.zeros(robot.nv)
-
-    def invert(self, q: Array, out: Array) -> None:
-        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
-        self._inertia.invert(q, out, quick=True)
 
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
@@ -234,14 +226,13 @@ class Accelerations:
         # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
         # is left out as well, because it accelerates all parts of the robot alike (equivalence
         # principle).
-        q_still, v_still = self._inertia.centred(q), self._still
+        q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
-            pull = tide.force(model, data, q_still)
-            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
+            pull, pull_by_q, pull_by_turn = tide.force(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
-        self._inertia.invert(q_still, inverse, quick=not self._resists)
+        self.inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         wrenches = actuation.wrenches(u)

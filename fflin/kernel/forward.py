@@ -82,11 +82,6 @@ def joint_position(robot, q, joint):
     return value / load(robot.scale, joint)
 
 
-def seen(robot, q):
-    """Return the base's quaternion relative to the reference."""
-    return vec.quaternion_times(vec.attitude(robot.origin), vec.attitude(q))
-
-
 def apply_faults(faults, triads, t, u, given):
     """Write the inputs that faulty actuators produce for a command u at a time t."""
     for index in range(len(faults.gain)):
@@ -101,15 +96,16 @@ def turn_held(robot, point):
     """Rotate reference-frame wrenches to base axes."""
     pushing = point.pushing
     for index in range(len(robot.held)):
-        at = robot.held[index]
-        axes = vec.columns_of(seen(robot, point.q))
+        at, turn = robot.held[index], vec.attitude(robot.origin)
+        axes = vec.columns_of(vec.quaternion_times(turn, vec.attitude(point.q)))
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
 
 def push(work, tree, pushing):
     """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
 
-    Forces and torques on the base in `pushing` are in base axes.
+    Forces and torques on the base in `pushing` are in base axes. `bodies.write_columns` must have
+    written the columns of body-fixed inputs.
     """
     size, count = len(tree.row), len(tree.wrench_body)
     for index in range(size):
@@ -117,7 +113,6 @@ def push(work, tree, pushing):
     for index in range(len(tree.driven)):
         if tree.driven[index] >= 0:
             vec.add(work, tree.c + tree.driven[index], load(pushing, index))
-    bodies.write_columns(work, tree)
     for index in range(count):
         u = load(pushing, tree.input[index])
         for row in range(size):
@@ -132,6 +127,7 @@ def accelerate(work, robot, point, rates, to):
     """
     tree, nu = robot.tree, point.nu
     force, size = tree.c, len(tree.row)
+    bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
     vec.copy(work, force, point.wrench, 0, 6)
     bodies.move_bodies(work, tree, nu)

@@ -15,7 +15,7 @@ from fflin.kernel.allocation import allocate
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import angle, below, chosen, compiled, load, root, store, whole
+from fflin.kernel.vectors import angle, below, chosen, load, root, store, whole
 
 
 class Wheels(
@@ -178,16 +178,17 @@ class Arguments(
     """
 
 
+_OF_METHOD = {REAL: "h", INDICES: "origin", LANED: "rates along first second u"}
+METHOD, STOP_CONDITIONS = Struct(Method, REALS, _OF_METHOD), Struct(StopConditions)
 ARGUMENTS = Struct(
     Arguments,
+    FLAG,
     robot=MECHANICS,
-    method=Struct(Method, REALS, {LANED: "rates along first second u"}, h=REAL, origin=INDICES),
+    method=METHOD,
     law=LAW,
     channel=CHANNEL,
     reference=MOMENTUM_REFERENCE,
-    project=FLAG,
-    pushed=FLAG,
-    stop=Struct(StopConditions),
+    stop=STOP_CONDITIONS,
     point=POINT,
 )
 
@@ -229,7 +230,6 @@ def _move(robot, method, point, stage):
         vec.displace(robot.tree, point.q, along, point.q)
 
 
-@compiled
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs to the step `last`, or until a stop condition is met.
 
@@ -305,18 +305,10 @@ class RunStatistics(
     """
 
 
+_LANED = "sizes largest_x largest_u largest outside errors inputs states"
+_OF_STATISTICS = {INDICES: "kind steps", REAL: "settled", LANED: _LANED}
 RUN_STATISTICS = Struct(
-    RunStatistics,
-    REALS,
-    {
-        INDICES: "kind steps",
-        LANED: "sizes largest_x largest_u largest outside errors inputs states",
-    },
-    robot=MECHANICS,
-    law=LAW,
-    path=PATH,
-    settled=REAL,
-    at=POINT,
+    RunStatistics, REALS, _OF_STATISTICS, robot=MECHANICS, law=LAW, path=PATH, at=POINT
 )
 
 
@@ -354,7 +346,6 @@ def _compare(stats, step):
     store(sizes, 0, half * (360.0 / np.pi))
 
 
-@compiled
 def take(words, rows, first, count):
     """Update the statistics with `count` rows of `advance`, which begin at the step `first`.
 

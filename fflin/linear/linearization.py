@@ -288,7 +288,7 @@ class Linearizer:
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
-                self._accelerations.invert(q, B[self._lower])
+                self._accelerations.inertia.invert(q, B[self._lower], quick=True)
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)

@@ -21,13 +21,14 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOut
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, words_of, work_space
+from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
+OfOutputs: TypeAlias = LinearController | TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # With more steps, a single run uses the compiled loop, if its machine code is already stored.
 LONG = 20_000
@@ -139,20 +140,15 @@ class LaneLoop:
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
-        # Pairs of an array with one column per lane, and the column of its initial values.
-        self._fresh: list[tuple[Array, Array]] = []
-        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
-        self._words = words_of(self.parts, loop.ARGUMENTS)
+        # `_fresh` has pairs of an array with one column per lane and the column of initial values.
+        self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.tree.size)
-        self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
+        self._advance = kernel("loop", "advance")
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width, self.done = int(self.ends[-1]), 0
-        self._of_run = {
-            **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
-            **robot.tree._asdict(),
-            **robot.faults._asdict(),
-        }
+        self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
+        self._of_run |= robot.tree._asdict() | robot.faults._asdict()
 
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
@@ -353,7 +349,6 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
     return law._replace(
-        kind=policies.NOTHING,
         turned=list(state.axes),
         origin=pin.SE3ToXYZQUAT(state.origin),
         near=np.zeros(state.robot.n),
@@ -375,7 +370,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     if asking is not plan.plant:
         law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))
     if isinstance(policy, LinearController | TrajectoryOutputFeedback):
-        law = _filtered(law, plan, policy, asking, mechanics)
+        law = _filtered(law, plan, policy, asking)
     elif isinstance(policy, TrajectoryFeedback):
         law = law._replace(kind=policies.TRACK, path=_path(law.path, plan, policy, asking.state))
     elif isinstance(policy, StateFeedback | Gridded):
@@ -403,32 +398,26 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def _filtered(
-    law: policies.Law,
-    plan: Plan,
-    policy: LinearController | TrajectoryOutputFeedback,
-    asking: Plant,
-    mechanics: forward.Mechanics,
-) -> policies.Law:
+def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -> policies.Law:
     """Return the law of a compensator; along a trajectory, it has matrices for each sample."""
     state, times, rows = asking.state, plan.times, 1
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
-    samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
-    _, charts, near = zip(*samples, strict=True)
-    nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by, *_ in samples]
+    starts = [k * times.sample * times.dt for k in range(rows)]
+    _, measures, near = zip(*map(loop.at, starts), strict=True)
+    nz, stages = len(loop.estimate), 1 if times.sample else 1 + len(plan.method.nodes)
+    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(policy.terms, starts)]
     compensator = {
         key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
     }
     measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
-    axes = mechanics.tree.axes
+    axes = mechanics_of(plan.plant).tree.axes
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for chart in charts]),
+        origin=np.concatenate([pin.SE3ToXYZQUAT(each.state.origin) for each in measures]),
         near=np.concatenate([x[state.groups.q_m] for x in near]),
         filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=measured,
@@ -442,9 +431,8 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     """Return the allocation from the commands of `asking` to the inputs of `giving`."""
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
-    point = empty(forward.POINT)._replace(
-        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
-    )
+    inputs = max(len(robot.actuation.names) for robot in (asking, plant))
+    point = empty(forward.POINT)._replace(q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs))
     return allocation.Allocation(
         asking=asks,
         giving=giving,

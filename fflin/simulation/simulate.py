@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
-from time import perf_counter
 from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.process import LONG_RUN
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
-from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
@@ -30,13 +26,6 @@ from fflin.simulation.run import Conserved, Disturbance, Recording, go
 # deviation from the operating point consists of the robot's states, followed by the states of a
 # continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
-
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. A run
-# then takes about the fraction _FRACTION of the time. Compiling takes about _COMPILING seconds, but
-# only once.
-_FRACTION, _COMPILING = 0.1, 30.0
-
-_log = logging.getLogger("fflin")
 
 
 def simulate(
@@ -202,14 +191,8 @@ def simulate(
     plan = Plan(SimulationOptions(**locals()))
     foresees, compiled = predictor(plan), engine_of(engine, plan) == "compiled"
     hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
-    began = perf_counter()
     try:
-        run = recorded(plan) if compiled else go(plan, hint)
-        if hint and (spent := perf_counter() - began) > LONG_RUN:
-            once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-            said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
-            _log.warning(f"fflin: {said} would take about %.0f s%s", spent, _FRACTION * spent, once)
-        return motion_of(plan, run, foresees)
+        return motion_of(plan, recorded(plan) if compiled else go(plan, hint), foresees)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "
@@ -284,7 +267,7 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            by, model = policy.terms, lin
+            by, model = policy.terms(), lin
             z: Array = np.zeros(len(by.A))
 
             def command(e: Array) -> Array:
@@ -321,8 +304,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if lin is None:  # a model in discrete time without its motion between samples
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = [lin.state_names.index(f"qdot_m.{name}") for name in plan.limits.wheel_names]
-    channel = plan.channel(foresees[1], speeds=lambda e: (x0 + e)[of])
+    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of their speeds in x
+    applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 
@@ -331,18 +314,18 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
-            rate = lin.A @ at + lin.B @ (channel.begin(0, at) - u0) + lin.f0
+            rate = lin.A @ at + lin.B @ (applied(0, at) - u0) + lin.f0
             after = after + weight * dt / 6.0 * rate
         return after
 
-    cuts = not sample and channel.cuts
+    cuts = not sample and plan.limits.cuts
     held = lin.discretize(dt) if sample else lin
     A, B, f0 = held.A, held.B, held.f0
     if not (sample or cuts):  # a step is then e -> A e + f0
         f0 = stepped(np.zeros(len(e)))
         A = np.column_stack([stepped(unit) - f0 for unit in np.eye(len(e))])
     for step in range(steps):
-        u = channel.begin(step, e) if sample else u0
+        u = applied(step, e) if sample else u0
         if step % every == 0:
             rows.append(e)
         e = stepped(e) if cuts else A.dot(e) + B.dot(u - u0) + f0
