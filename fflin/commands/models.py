@@ -15,7 +15,7 @@ import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
 from fflin.base.names import runs
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals, width
-from fflin.base.writing import check_ending, check_output_path, write_atomically
+from fflin.base.writing import check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
     SHOWN,
@@ -110,7 +110,6 @@ def init(arguments: Namespace) -> Report:
     if found.path.suffix.lower() == ".toml":
         raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
     target = arguments.output_file or Path(f"{found.name}.toml")
-    check_output_path(target)
     if target.exists() and not arguments.force:
         raise FileError(
             f"{target} already exists; give another name with -o, or replace the file with --force"
@@ -155,16 +154,12 @@ def linearize(arguments: Namespace) -> Report:
     example: fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat
     """
     path, tool = arguments.output_file, getattr(arguments, "for")
-    if tool and arguments.trajectory:
-        raise InputError(
-            "--for converts the model about one operating point, but --trajectory defines many; "
-            "remove one of them"
-        )
     if tool and not path:
         raise InputError("--for saves the converted model; add -o FILE")
     if path and (tool or arguments.trajectory):
         check_ending(path, (".npz", ".mat", ".json"))
     if arguments.trajectory:
+        refuse(arguments, ("for",), "this option converts one model, but --trajectory gives many")
         refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")
         along = models_along(arguments)
         if arguments.dt is not None:
@@ -186,10 +181,8 @@ def check(arguments: Namespace) -> Report:
     example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
     """
     if arguments.trajectory:
-        from fflin.linear.check import held_to
-
         along = models_along(arguments)
-        robot, found = along.robot, held_to(arguments.tolerance, along.check())
+        robot, found = along.robot, along.check(tolerance=arguments.tolerance)
         text = f"{found}\n\n{along}"
     else:
         robot, lin = linear_model(arguments)

@@ -189,16 +189,11 @@ class Drawing:
 
 def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
-    model, pieces = robot.model, robot.pieces
-    if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body drawn as a box of its inertia
-        mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
-    else:
-        known = pieces.get(shape.link) or robot.links.get(shape.link)
-        mass, at = known.mass if known else 0.0, find_frame(model, shape.link)[1]
-        for bending in bendings(robot).values():
-            if bending.node == shape.joint:
-                at = bending.frame.actInv(at)
-    return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
+    known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
+    mass = known.mass if known else 0.0
+    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # its inertia is drawn
+        mass = robot.model.inertias[shape.joint].mass
+    return [mass, *pin.SE3ToXYZQUAT(shape.at).round(6).tolist()]
 
 
 def typed(array: Array | Indices, kind: str = "<f4") -> object:

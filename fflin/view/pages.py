@@ -21,13 +21,14 @@ from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.joints import find_frame, find_joint
+from fflin.robot.joints import find_frame
 from fflin.robot.robot import ROOT, Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
+from fflin.view.shapes import carriers_of
 
 # Number of poses in a period, and the duration of a period on the screen [s]. The amplitude is
 # chosen such that no rotation exceeds _ANGLE [rad], and no displacement exceeds _SHARE times the
@@ -246,8 +247,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
 def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
     """Return the poses of a captured payload, for rows of q (N, nq) of the combined robot."""
     model, data = robot.model, robot.model.createData()
-    names = [f"{caught.prefix}.{name}" for name in list(caught.payload.model.names)[ROOT + 1 :]]
-    places = [find_frame(model, caught.prefix), *(find_joint(model, name) for name in names)]
+    places = carriers_of(robot, caught.prefix, caught.payload)
     poses = []
     for q in rows:
         pin.forwardKinematics(model, data, q)
