@@ -180,10 +180,8 @@ def check(arguments: Namespace) -> Report:
     example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
     """
     if arguments.trajectory:
-        from fflin.linear.check import held_to
-
         along = models_along(arguments)
-        robot, found = along.robot, held_to(arguments.tolerance, along.check())
+        robot, found = along.robot, along.check(tolerance=arguments.tolerance)
         text = f"{found}\n\n{along}"
     else:
         robot, lin = linear_model(arguments)

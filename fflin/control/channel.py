@@ -155,16 +155,13 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
     slots = delay // sample + 1 if sample else 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
-        low=limits.low,
-        high=limits.high,
+        **limits._replace(pulses=limits.pulses._replace(**fresh))._asdict(),
         held=initial.copy(),
         pending=np.zeros(slots * len(initial)),
         slots=slots,
         sample=sample,
         delay=np.array([float(delay)]),
         fresh=np.zeros(1),
-        wheels=limits.wheels,
-        pulses=limits.pulses._replace(**fresh),
     )
     rules.limit(channel, channel.held)
     return channel

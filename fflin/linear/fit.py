@@ -24,6 +24,17 @@ Names: TypeAlias = tuple[str, ...]
 Signals: TypeAlias = tuple[Names, Names]
 
 
+def about_point(lin: object) -> LinearModel:
+    """Return a linear model about a point; raise `InputError` for a moving reference."""
+    model = instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    if model.moving:
+        raise InputError(
+            "the model has a moving reference, expected a fixed one; linearise with moving=False, "
+            "or follow the moving reference with TrajectoryFeedback"
+        )
+    return model
+
+
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
     """Raise `InputError` if a model's states or inputs differ from the robot's.
 
@@ -134,11 +145,7 @@ def outputs(
     array([0. , 0.4, 0. ])
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:
-        raise InputError(
-            "the model has a moving reference, expected a fixed one; linearise with moving=False"
-        )
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    state = StateMap(robot, reference=about_point(lin).reference, frame=lin.frame)
     require_fit(lin, robot, state)
     require_sensed(lin, state)
     at = robot.checked_configuration(q)
