@@ -20,7 +20,7 @@ from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
-from fflin.control.weights import Weight, sampled_cost, weight
+from fflin.control.weights import Rule, Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
@@ -28,7 +28,7 @@ from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
 # Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
-Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
+Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST_ENTRIES = 20_000_000
@@ -60,7 +60,7 @@ def mpc(
     dt: float | None = None,
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
-    weights: str | None = None,
+    weights: Rule | None = None,
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
@@ -102,7 +102,7 @@ def mpc(
     Qf : "steady", or as Q
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
-    weights : {"urdf", "identity"}, optional
+    weights : {"urdf", "identity"} or mapping, optional
         Rule for the weights if Q and R are omitted, as in `lqr`.
 
     Returns
@@ -240,10 +240,6 @@ def _unplanned(
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
-    if (least := low > high).any():
-        raise InputError(
-            f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
-        )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
     if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
         raise InputError(

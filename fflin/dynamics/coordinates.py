@@ -81,13 +81,16 @@ def _axes_of(**units: str) -> dict[str, str]:
     return {f"{name}.{axis}": unit for name, unit in units.items() for axis in "xyz"}
 
 
+_POSE, _TWIST = _axes_of(q_b="1", r_b="m"), _axes_of(omega_b="rad/s", v_b="m/s")
+
+
 def state_units(robot: Robot) -> dict[str, str]:
     """Return the names and units of the 12 + 2n states as {name: unit}."""
     q_m, qdot_m = dict[str, str](), dict[str, str]()
     for joint in robot.joints:
         unit = joint.unit
         q_m[f"q_m.{joint.name}"], qdot_m[f"qdot_m.{joint.name}"] = unit, f"{unit}/s"
-    return _axes_of(q_b="1", r_b="m") | q_m | _axes_of(omega_b="rad/s", v_b="m/s") | qdot_m
+    return _POSE | q_m | _TWIST | qdot_m
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
