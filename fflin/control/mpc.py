@@ -240,10 +240,6 @@ def _unplanned(
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
-    if (least := low > high).any():
-        raise InputError(
-            f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
-        )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
     if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
         raise InputError(
