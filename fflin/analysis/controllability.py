@@ -233,12 +233,11 @@ def _by_second_order(
     if source is None:
         return None
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
-    idle, margin = ranks.null_space(system.S.T @ np.diag(1.0 / system.size))
+    idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
-        everything, margin = np.eye(2 * r), margin.transformed(R / system.size)
-        fixed = ranks.FixedPoles(margin=margin)
+        everything, fixed = np.eye(2 * r), ranks.FixedPoles(margin=margin.transformed(R))
         return everything, everything[:0], [], "closed form", fixed
     S = system.S.T
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
@@ -250,10 +249,8 @@ def _by_second_order(
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.
-    size = np.tile(system.size, 2)
-    normal = rows / size
-    normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
-    controllable = normal[:, len(rows) :] / size[:, None]
+    exact, scale = ranks.Noisy.exact(rows), 1.0 / np.tile(system.size, 2)
+    controllable, _ = ranks.null_space(exact, scale)
     to_s = np.linalg.inv(
         (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
     )

@@ -178,10 +178,15 @@ def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin
     return Margin(tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near))
 
 
-def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
-    """Return an orthonormal basis (n, k) of the null space, and its margin; see `right_vectors`."""
-    _, vectors, rank, margin = right_vectors(*matrix, states)
-    return np.real(vectors[:, rank:]), margin
+def null_space(matrix: Noisy, scale: Array | float = 1.0, states: int = 1) -> tuple[Array, Margin]:
+    """Return a basis (n, k) of the null space, and its margin; see `right_vectors`.
+
+    The basis is orthonormal in coordinates that `scale` (n,) multiplies.
+    """
+    scales = np.broadcast_to(scale, matrix.values.shape[1])
+    values, noise = matrix.values * scales, matrix.noise * scales
+    _, vectors, rank, margin = right_vectors(values, noise, states)
+    return scales[:, None] * np.real(vectors[:, rank:]), margin.transformed(scales)
 
 
 def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:

@@ -319,7 +319,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 def rigid_forces(body: LinearModel) -> Noisy:
     """Return the input matrix (r, nu) of the rigid motions, on which no spring acts."""
     system = mechanics.second_order(body)
-    motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
+    motions, _ = null_space(system.K.T, 1.0 / system.size)
     return system.S.after(motions.T)
 
 
