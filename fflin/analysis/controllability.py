@@ -344,8 +344,7 @@ def _root(W: Array) -> Array:
     """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
     # The condition number of L is the square root of the condition number of W, so the rank of L is
     # easier to decide.
-    size = np.sqrt(W.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
+    size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
     return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
@@ -377,10 +376,8 @@ def _reached(
         # Rows and columns have different units, so they are scaled to comparable sizes.
         rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
         for _ in range(4):
-            sizes = np.sqrt(np.abs(scaled).max(axis=1))
-            rows /= np.where(sizes > 0.0, sizes, 1.0)
-            sizes = np.sqrt(np.abs(scaled).max(axis=0))
-            columns /= np.where(sizes > 0.0, sizes, 1.0)
+            rows /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=1)))
+            columns /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=0)))
             scaled = rows[:, None] * matrix * columns
         left, values, _ = np.linalg.svd(scaled)
         vectors: Values = left.conj().T * rows

@@ -147,12 +147,12 @@ def second_order(lin: LinearModel) -> SecondOrder:
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # To find rounding errors, each entry of S is compared with the norm of its own column.
-    each = np.linalg.norm(S.values / size[:, None], axis=0)
+    each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
         K=ranks.without_rounding(K @ -N, size, size),
         D=ranks.without_rounding(D @ -np.eye(nv), size, size),
-        S=ranks.without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+        S=ranks.without_rounding(S, size, each),
     )
 
 

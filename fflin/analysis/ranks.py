@@ -172,6 +172,11 @@ def right_vectors(
     return singular, vectors, rank, judged(singular / tolerance, vectors, rank, states)
 
 
+def divisors(sizes: Array) -> Array:
+    """Replace sizes of 0 by 1, so that vectors of size 0 stay 0 if they are divided by them."""
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank from singular values divided by the tolerance."""
     near = range(max(rank - 1, 0), min(rank + 1, len(ratios)))
