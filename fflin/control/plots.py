@@ -332,8 +332,8 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
         turned = changes(np.imag, i, values[:, i].real < 0.0)
         turned += [value[i] for value in ends if value[i].real < 0.0]
-        angles = [math.degrees(np.angle(value)) - 180.0 for value in crossed]
-        phase = min((abs(math.remainder(x, 360.0)) for x in angles), default=math.inf)
+        phases = [180.0 - abs(math.degrees(np.angle(value))) for value in crossed]
+        phase = min(phases, default=math.inf)
         factors = [1.0 / abs(value) if value else math.inf for value in turned]
         low = max((x for x in factors if _NOTHING < x < 1.0), default=0.0)
         high = min((x for x in factors if x > 1.0), default=math.inf)

@@ -124,7 +124,7 @@ def load(
         notes=urdf.notes,
         package_dirs=dirs,
         links={
-            name: LinkMass(link.mass, link.tensor, link.com.placement)
+            name: LinkMass(link.mass, link.inertia, link.com.placement)
             for name, link in urdf.links.items()
             if link.mass
         },
