@@ -21,7 +21,7 @@ from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
-from fflin.linear.fit import about_point, require_sensed
+from fflin.linear.fit import about_point, require_fit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -173,7 +173,7 @@ class LinearController(Feedback):
             If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
         lin, terms, state = self.lin, self.terms(), self.state_map(robot)
-        require_sensed(lin, state)
+        require_fit(lin, robot, state, sensed=True)
         always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
         return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
 
