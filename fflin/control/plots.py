@@ -61,10 +61,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
-        drawn = [
-            np.ma.masked_where((m == 0.0) | (np.abs(m) < rounding(m)), np.abs(m))
-            for m in (lin.A, lin.B)
-        ]
+        drawn = [np.ma.masked_where(np.abs(m) <= rounding(m), np.abs(m)) for m in (lin.A, lin.B)]
         entries = np.concatenate([m.compressed() for m in drawn])
         top = float(entries.max(initial=0.0)) or 1.0
         norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
@@ -133,10 +130,8 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
             growth = "grows" if mode.unstable else "decays"
             label = f"real, {growth} in {mode.time_constant:.3g} s"
             if mode.oscillates:
-                label = (
-                    f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
-                    f"damping {mode.damping_ratio:.2g}"
-                )
+                rate, hertz = mode.frequency, mode.frequency / (2.0 * np.pi)
+                label = f"{rate:.3g} rad/s, {hertz:.3g} Hz, damping {mode.damping_ratio:.2g}"
             labels.append(label)
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
         axes.set_yticks(range(count), labels, fontsize=8)
@@ -360,13 +355,8 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
 
 def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
     for index, (label, values) in enumerate(sets.items()):
-        axes.plot(
-            values.real,
-            values.imag,
-            "x" if index == 0 else "+",
-            color=COLORS[index % len(COLORS)],
-            label=label or None,
-        )
+        color, marker = COLORS[index % len(COLORS)], "+" if index else "x"
+        axes.plot(values.real, values.imag, marker, color=color, label=label or None)
     if dt:
         angle = np.linspace(0.0, 2.0 * np.pi, 201)
         axes.plot(np.cos(angle), np.sin(angle), color=_LINE, lw=0.8)
