@@ -136,12 +136,9 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
         axes.set_yticks(range(count), labels, fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
-        figure.legend(
-            handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
-            title="largest entry: 1; outline: modulus of an entry out of phase",
-            loc="outside lower center",
-            ncols=len(colors),
-        )
+        patches = [Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()]
+        said = "largest entry: 1; outline: modulus of an entry out of phase"
+        figure.legend(handles=patches, title=said, loc="outside lower center", ncols=len(colors))
         figure.suptitle(title)
     return figure
 
@@ -269,13 +266,9 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
             f"{name}: {min(loop.phase, 180.0):.0f} deg, {loop.gain[0]:.2g} to {loop.gain[1]:.3g}"
             for name, loop in zip(gain.input_names, loops, strict=True)
         )
-        figure.legend(
-            sizes.get_lines()[: len(loops)],
-            names,
-            title="margins at each input: phase, gain factors",
-            loc="outside right upper",
-            fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
-        )
+        lines, said = sizes.get_lines()[: len(loops)], "margins at each input: phase, gain factors"
+        letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
+        figure.legend(lines, names, title=said, loc="outside right upper", fontsize=letters)
         # Discrete-time poles z lie close together near 1, so their rates ln(z)/dt are drawn.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
