@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import EDGE, CampaignJob, Judge, completed
+from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -159,14 +159,12 @@ def settling_runs(
     checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
     dt, every = dt / finer, every * finer
     options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
-    options |= {"limits": limits, "project": not predicts}
     # Without `limits`, inputs do not saturate, and thrusts can be negative.
-    options |= {"unlimited": limits is None}
-    options |= {"histories": checks + 1} if predicts else {}
-    step = _transition(loop, dt, every) if predicts else None
-    figures, over = partial(_figures, loop, step), None if predicts else partial(_is_over, loop)
-    judge = Judge(("outcome", "error"), figures, over)
-    return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, engine, options, judge)
+    options |= {"limits": limits, "unlimited": limits is None, "project": not predicts}
+    options |= {"histories": checks + 1 if predicts else 1}
+    judge = partial(_figures, loop, _transition(loop, dt, every) if predicts else None)
+    over, policy = None if predicts else partial(_is_over, loop), StateFeedback(lin, loop.K)
+    return CampaignJob(loop.robot, policy, None, 0, engine, options, judge, over)
 
 
 def _transition(loop: Loop, dt: float, every: int) -> Array:
@@ -199,7 +197,7 @@ def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[
     `step` is the transition matrix of the linear loop from one history entry to the next. If it is
     None, runs are not compared with the linear loop.
     """
-    e, stop = runs["state_errors"][:, :, loop.model_states], runs["stop"]
+    e, stop = runs["state_errors"][..., loop.model_states], runs["stop"]
     last, first = loop.size(runs["x"][:, loop.model_states] - loop.lin.x0), loop.size(e[:, 0])
     turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
     diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
