@@ -43,7 +43,7 @@ def test_import_pays_for_nothing_heavy():
     assert not after("--help") & (heavy | {"numpy", "pinocchio"})
     # Neither does a command pay for what others need; each of these takes a millisecond and more.
     heavy |= {"numpy.ma", "numpy.testing", "numpy.typing", "subprocess", "tempfile", "html"}
-    heavy |= {"numba", "fflin.commands.campaigns", "fflin.commands.control"}
+    heavy |= {"numba", "fflin.commands.control"}
     moving = "linearize servicer_7dof --stiffness panel_left=9 --velocity omega_b.z=0.1"
     for words in ("linearize ets_vii", moving, "check ets_vii", "info ets_vii"):
         assert after(words) & (heavy | {"pinocchio"}) == {"pinocchio"}, words

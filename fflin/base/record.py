@@ -30,17 +30,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from fflin.base import writing
 from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.validation import Result
-from fflin.base.writing import (
-    as_path,
-    check_ending,
-    missing,
-    read_file,
-    reason,
-    shown,
-    write_atomically,
-)
 
 CHECKSUM = "sha256"
 
@@ -59,17 +51,17 @@ _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
     """Write a record in the format of the path's ending, with a digest if `checksummed`."""
-    check_ending(path, FORMATS)
+    writing.check_ending(path, FORMATS)
     require_finite(record)
-    write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
+    writing.write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
     """Read a file within `reading`; return its record, and whether its digest was verified."""
     # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
     # has no empty matrices.
-    check_ending(path, FORMATS)
-    return CODECS[path.suffix][1](read_file(path, path.suffix))
+    writing.check_ending(path, FORMATS)
+    return CODECS[path.suffix][1](writing.read_file(path, path.suffix))
 
 
 @contextmanager
@@ -82,11 +74,13 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except (FileError, MissingPackageError):
         raise
     except FileNotFoundError:
-        raise FileError(f"{path}: No such file{missing(path)}") from None
+        raise FileError(f"{path}: No such file{writing.missing(path)}") from None
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
-            raise FileError(f"{shown(path)}: does not fit into memory") from None
-        raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
+            raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
+        raise FileError(
+            f"{writing.shown(path)}: not a {what} saved by fflin ({writing.reason(error)})"
+        ) from None
 
 
 def require_finite(record: Mapping[str, object]) -> None:
@@ -272,7 +266,7 @@ class Design(Result):
         InputError
             If a value is not finite.
         """
-        write_record(as_path(path), record_of(self), checksummed=self.verified)
+        write_record(writing.as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
     def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
@@ -296,7 +290,7 @@ class Design(Result):
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
         """Read a file as `load` does; `given` sets the fields that files do not contain."""
-        source, name = as_path(path), cls.__name__
+        source, name = writing.as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)
             if text(record["kind"]) != name:

@@ -93,7 +93,7 @@ class TomlFile:
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
         """Return the path of the first key, string or pattern of a table that a message names."""
-        head = ".".join(map(str, table)) + "."
+        head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         found = re.findall(r"'([^']+)'| (\S+) is ", message)
         names = [name for one, other in found if (name := one or other.strip("'"))]

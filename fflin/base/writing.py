@@ -14,6 +14,7 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from itertools import combinations
 from pathlib import Path
 
 from fflin.base.errors import FileError, InputError
@@ -177,14 +178,11 @@ def check_output_path(target: Path) -> None:
 
 def check_distinct(*targets: Path | None) -> None:
     """Raise `FileError` if two paths of outputs lead to the same file; ignore None."""
-    seen: list[Path] = []
-    for target in filter(None, targets):
-        for first in seen:
-            same = os.path.realpath(first) == os.path.realpath(target)
-            if same or same_file(first, target):
-                said = f"outputs {target} and {first} are the same file"
-                raise FileError(f"{said}; give each output its own file")
-        seen.append(target)
+    for first, target in combinations(filter(None, targets), 2):
+        same = os.path.realpath(first) == os.path.realpath(target)
+        if same or same_file(first, target):
+            said = f"outputs {target} and {first} are the same file"
+            raise FileError(f"{said}; give each output its own file")
 
 
 def missing(path: Path, otherwise: str = "") -> str:

@@ -32,7 +32,7 @@ from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
-from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
+from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import checked_engine
 from fflin.kernel.tree import LANES
 from fflin.linear.linearization import LARGEST, Linearizer
@@ -156,14 +156,8 @@ def sweep(
     """
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    job = ChunkJob(
-        robot,
-        at_rest=v is None and u is None,
-        engine=engine,
-        frame=frame,
-        reference=reference,
-        moving=moving,
-    )
+    linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
+    job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
     task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
@@ -196,20 +190,9 @@ class ChunkJob:
     neither is given, the caller sets `at_rest`.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        at_rest: bool,
-        engine: str | None = None,
-        frame: Frame | None = None,
-        reference: pin.SE3 | None = None,
-        moving: bool = False,
-    ) -> None:
-        options: Any = {"frame": frame, "reference": reference, "moving": moving}
-        self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
-        self.linearizer = Linearizer(robot, **options)
-        prepared = self.linearizer.prepared
+    def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
+        self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
+        self.linearizer, prepared = linearizer, linearizer.prepared
         reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
         if reason and engine == "compiled":
             raise InputError(
@@ -220,8 +203,6 @@ class ChunkJob:
         if engine != "python" and not reason:
             self._kernel = prepared.kernel()
         self.threaded = self._kernel is not None
-        self._data = robot.create_data()
-        self._inertia = Inertia(prepared.map, self._data)
         # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
         # each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -235,7 +216,7 @@ class ChunkJob:
                 self.shapes["_drift"] = (nx,)
             if prepared.sensing is not None:
                 self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
-        self.row_bytes = 8 * (robot.nq + sum(map(math.prod, self.shapes.values())))
+        self.row_bytes = 8 * (linearizer.robot.nq + sum(map(math.prod, self.shapes.values())))
 
     def __reduce__(self) -> tuple[object, ...]:
         # Only the arguments are pickled, because each worker allocates its own work arrays.
@@ -243,33 +224,22 @@ class ChunkJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
-        left = self.write(rows, out)
+        left, nv = self.write(rows, out), self.shapes["B_lower"][0]
         if not len(left):
             return []
         with _TURN, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
                 with located(f"configuration {start + row}"):
-                    self._write_one(rows, row, out)
+                    if self.only_inertia:
+                        self.linearizer.write_by_u(rows["q"][row], out["B_lower"][row])
+                        continue
+                    point = {key: each[row] for key, each in rows.items()}
+                    lin = self.linearizer(point["q"], point.get("v"), point.get("u0"))
+                    for key, array in out.items():
+                        lower = key == "B_lower"
+                        array[row] = lin.B[nv:] if lower else getattr(lin, key.removeprefix("_"))
         return [str(note.message) for note in caught]
-
-    def _write_one(self, rows: Rows, row: int, out: Mapping[str, Array]) -> None:
-        """Linearise about one point in Python, and write the row of this point."""
-        q, nv = rows["q"][row], self.shapes["B_lower"][0]
-        if not self.only_inertia:
-            point = {key: each[row] for key, each in rows.items()}
-            lin = self.linearizer(q, point.get("v"), point.get("u0"))
-            for key, array in out.items():
-                array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.removeprefix("_"))
-            return
-        inertia, actuation = self._inertia, self.linearizer.prepared.actuation
-        B_lower = out["B_lower"][row]
-        inverse = B_lower if actuation.default else np.empty((nv, nv))
-        inertia.invert(q, inverse)
-        if not actuation.default:
-            # The input matrix does not depend on the base position. So the base is moved to the
-            # origin, which avoids rounding errors.
-            np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code, and return the indices of rows that Python must compute."""

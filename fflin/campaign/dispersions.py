@@ -250,8 +250,8 @@ class Dispersions:
             try:
                 self.starts(drawn)
                 # A drawn inertia can be too small for the flexible modes of its body.
-                if appendages := self._plant.robot.appendages:
-                    refused = first_impossible(self._model, appendages, self.bodies(drawn))
+                if self._plant.robot.appendages:
+                    refused = first_impossible(self._plant.robot, self.bodies(drawn))
                     if refused is not None:
                         said = f"run {start + refused} draws an invalid mass or inertia"
                         self.one(drawn[refused])

@@ -30,7 +30,7 @@ from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of
 from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, laid_out, words_of
+from fflin.kernel.tree import LANES, laid_out
 from fflin.robot.robot import Robot
 from fflin.simulation import lanes
 from fflin.simulation.motion import Motion
@@ -346,9 +346,7 @@ class RunStatistics(lanes.Statistics):
             inputs=np.zeros(times * len(initial)),
             states=np.full(times * state.nx, np.nan),
         )
-        self._fresh: list[tuple[Array, Array]] = []
-        self._marks = laid_out(marks, loop.RUN_STATISTICS, lambda *pair: self._fresh.append(pair))
-        self._words = words_of(self._marks, loop.RUN_STATISTICS)
+        self._marks, self._words, self._fresh = laid_out(marks, loop.RUN_STATISTICS)
 
     def reset(self) -> None:
         """Prepare for eight new runs."""
@@ -362,7 +360,7 @@ class RunStatistics(lanes.Statistics):
 
     def add(self, first: int, rows: Array) -> None:
         """Add steps from step `first` on; `rows` (steps, width, LANES) has q, nu, u and more."""
-        take = kernel("loop", "take", "the run statistics")
+        take = kernel("loop", "take")
         take(self._words, rows.reshape(-1, LANES), first, len(rows))
         sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
         self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]

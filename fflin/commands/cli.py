@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
+import math
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import fflin
 from fflin.base import __version__
-from fflin.base.errors import FflinError, FflinWarning
-from fflin.base.writing import check_ending, check_output_path, files_of_command
-from fflin.commands import BAD_INPUT, DONE, options, parser
-from fflin.commands.results import finish, require_own_kind
+from fflin.base.errors import FflinError, FflinWarning, FileError
+from fflin.base.tables import first_paragraph, headed
+from fflin.base.writing import check_ending, check_output_path, files_of_command, followed_path
+from fflin.commands import BAD_INPUT, DONE, parser
+
+if TYPE_CHECKING:
+    from fflin.commands.builders import Report
 
 # {task: commands}, in the order of the help.
 TASKS = {
@@ -28,10 +37,22 @@ TASKS = {
     "many models or simulations": ("sweep", "montecarlo"),
 }
 
-# {command: module that defines it}. The module `models` defines all other commands.
-_MODULES = {
-    **dict.fromkeys(("montecarlo", "validity", "funnel", "sweep"), "campaigns"),
-    **dict.fromkeys(("lqr", "tvlqr", "plan", "simulate", "export", "view"), "control"),
+# Commands of the module `control`; the module `models` defines all other commands.
+_CONTROL = (
+    *("lqr", "tvlqr", "plan", "simulate", "export"),
+    *("montecarlo", "validity", "funnel", "sweep"),
+)
+
+# For files with these endings, the report shows the file size.
+_PAGES = (".html", ".gif")
+
+# Entries by which the kind of a result is recognised if its file does not state the kind.
+_ENTRIES = {
+    "Sensitivity": {"urdf_sha256", "dA", "dB"},
+    "LinearModel": {"urdf_sha256", "certificate"},
+    "LinearBatch": {"header", "B_lower"},
+    "Campaign": {"header", "drawn"},
+    "Motion": {"t [s]", "q_b.x"},
 }
 
 
@@ -60,7 +81,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             hint = f"; did you mean {near[0]}?" if near else ""
             chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         parser.settle_former_names(arguments)
-        inputs, outputs = parser.files_of(arguments)
+        given = [
+            (action.type, value)
+            for action in arguments.command._actions
+            if (value := getattr(arguments, action.dest, None)) is not None
+        ]
+        outputs = [(path, kind) for kind, path in given if isinstance(kind, parser.OutputFile)]
+        readers = parser.input_file, parser.input_name
+        inputs = [Path(name) for kind, name in given if kind in readers]
         with files_of_command(inputs, [path for path, _ in outputs]):
             # Check the output files first, so that an unwritable file is reported before any
             # computation.
@@ -107,9 +135,127 @@ def _parser(asked: str) -> parser.Command:
     for task, names in TASKS.items():
         group = main.add_argument_group(task)
         for name in names if not known else {asked} & {*names}:
-            module = import_module(f"fflin.commands.{_MODULES.get(name, 'models')}")
-            options.add_command(commands, getattr(module, name))
+            module = "control" if name in _CONTROL else "models"
+            parser.add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
         # argparse puts all commands in one group; move them to the group of their task.
         group._group_actions += commands._choices_actions
         commands._choices_actions = []
     return main
+
+
+def finish(report: Report, arguments: argparse.Namespace) -> int:
+    """Write the files of a report, print the report, and return the exit code."""
+    command, said = arguments.command.prog.split()[-1], [report.interrupted]
+    written: list[Path] = []
+    # Write the files before the report is printed, so that a closed pipe cannot prevent writing
+    # them. If writing a file fails, the report is still printed.
+    try:
+        for path, write in report.files.items():
+            if path is None:
+                continue
+            if report.interrupted and path.exists():
+                said.append(f"{path} is unchanged")
+                continue
+            if write:
+                write(path)
+            written.append(path)
+    finally:
+        if arguments.json:
+            head: dict[str, object] = {
+                "fflin": __version__,
+                "command": command,
+                "robot": report.robot,
+                "result": first_paragraph(report.text),
+                "files": [str(path) for path in written],
+            }
+            result = plain(report.result)
+            assert isinstance(result, dict)
+            # The common entries come first. An entry of the result with the same name does not
+            # replace them.
+            print(json.dumps(head | result | head, allow_nan=False))
+        else:
+            lines = [headed(command, report.text)]
+            for path in written:
+                size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
+                lines.append(f"wrote {path}{size}")
+            print("\n".join(lines))
+    if report.interrupted:
+        raise KeyboardInterrupt("; ".join(said))
+    return report.code
+
+
+def plain(value: object) -> object:
+    """Convert a value for JSON: arrays to lists, results to objects, and inf or NaN to null.
+
+    A result that can be saved is converted to the entries of its file, other results to their
+    fields.
+    """
+    import numpy as np
+
+    from fflin.base.record import Design, record_of
+    from fflin.linear.files import record_of as record_of_model
+
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, complex):
+        value = {"real": value.real, "imag": value.imag}
+    elif isinstance(value, fflin.LinearModel):
+        value = record_of_model(value)
+    elif isinstance(value, Design):
+        value = record_of(value)
+    elif is_dataclass(value):
+        own = {each.name: getattr(value, each.name) for each in fields(value)}
+        # Omit linear models, because they are results of their own.
+        value = {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
+    elif hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, Mapping):
+        return {str(key): plain(x) for key, x in value.items() if str(key)[0] != "_"}
+    if isinstance(value, list | tuple):
+        return [plain(x) for x in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else None
+
+
+def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
+    """Raise `FileError` if -o would replace a file of another kind."""
+    if path.suffix == ".csv" and "LinearModel" in kinds:
+        from fflin.linear.files import foreign_table
+
+        path = foreign_table(path) or path
+        followed_path(path)  # refuses a table that is an input file
+    if not path.is_file():
+        return
+    found = kind_of(path)
+    if found not in kinds and path.stat().st_size:
+        there = f"holds a {found}" if found else "exists and is not a result of fflin"
+        raise FileError(
+            f"{path} {there}; without --force, this command replaces only files that contain a "
+            f"{' or '.join(kinds)}. Give another file name, or add --force"
+        )
+
+
+def kind_of(path: Path) -> str:
+    """Return the class name of the result in a file, or "" if the class is unknown."""
+    import numpy as np
+
+    from fflin.base.record import CODECS, text
+
+    kind = ""
+    try:
+        if path.suffix == ".csv":
+            with path.open(encoding="utf-8") as file:
+                names = {*file.readline().strip().split(",")}
+        elif path.suffix == ".h5":
+            from fflin.batch.files import hdf5
+
+            with hdf5().File(path, "r") as file:
+                names = {*file, *file.attrs}
+        elif path.suffix == ".npz":
+            with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
+                names, kind = {*entries}, text(entries.get("kind", ""))
+        else:
+            entries, _ = CODECS[path.suffix][1](path.read_bytes())  # `read_file` registers an input
+            names, kind = {*entries}, text(entries.get("kind", ""))
+    except Exception:  # each decoder raises its own types
+        return ""
+    return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")

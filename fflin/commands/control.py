@@ -1,47 +1,46 @@
-"""Commands for controller design, simulation and C code; builders of closed loops."""
+"""Commands for controllers, simulations, C code, and many simulations or models."""
 
 from __future__ import annotations
 
 import sys
-import warnings
 from argparse import Namespace
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import fflin
-from fflin.base.errors import FflinWarning, InputError, UnknownNameError
-from fflin.base.names import chosen, input_keys, rates_by_name
+from fflin.base.errors import FileError, InputError
+from fflin.base.names import chosen, input_keys
+from fflin.base.process import Progress
 from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.points import (
-    attitude,
+from fflin.commands.builders import (
+    Report,
+    along,
+    check_pictures,
+    designed,
     limits_of_options,
-    linear_model,
     load_robot,
-    model_about,
+    loop_of,
     models_along,
     once,
+    pictures,
     point_of,
+    reference_of,
     refuse,
+    robot_of_design,
+    schedule_of,
     state_of,
 )
-from fflin.commands.results import Report
 
 if TYPE_CHECKING:
-    import pinocchio as pin
-
     from fflin.base.validation import Array
-    from fflin.control.mpc import Mpc
+    from fflin.batch.configurations import Configurations
 
-_WEIGHTS = ("weights", "q", "r", "bryson", "sample")
-_POSE = ("target_rpy", "target_position")
-_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
-
-_FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
-
+_ROWS = 240  # rows of errors and inputs in a figure
+_RUNS = ("dt", "knots", "samples", "seed", "confidence", "threads")
 
 _ALLOCATED = (
     "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
@@ -123,7 +122,7 @@ def plan(arguments: Namespace) -> Report:
     q0, v0 = state_of(robot, arguments, robot.point, robot.start)
     motion = fflin.plan(
         robot,
-        target_of(robot, arguments)[:2],
+        point_of(robot, arguments, "target_")[:2],
         arguments.duration,
         q0=q0,
         v0=v0,
@@ -163,281 +162,180 @@ def simulate(arguments: Namespace) -> Report:
     return Report(robot.name, motion_record(motion), text, files, code, interrupted)
 
 
-def view(arguments: Namespace) -> Report:
-    """Show a robot live in the browser with a slider for each joint.
+def montecarlo(arguments: Namespace) -> Report:
+    """Simulate a loop with random parameters; show quantiles, success rates and the worst runs.
 
-    example: fflin view servicer_7dof --joint joint_2=0.4
+    example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
     """
-    from fflin.view.live import Live
+    from fflin.campaign.report import campaign_record, worst_runs
+    from fflin.control.policies import bound
 
+    path = arguments.output_file
+    is_table = path is not None and path.suffix in (".csv", ".mat")
+    if is_table and path.exists() and not arguments.force:
+        raise FileError(f"{path} already exists; give another file name, or add --force")
+    dispersions = fflin.load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
-    q, _ = state_of(robot, arguments, robot.point, robot.start)
-    how = {name: getattr(arguments, name) for name in (*_SHOWN, "frame")}
-    live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
-    assert isinstance(live, Live)  # since there is no motion
-    print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
-    if not arguments.no_open:
-        live.open()
-    live.wait()
-    return Report(robot.name, {}, f"{robot.name}: the view is closed")
-
-
-def robot_of_design(
-    robot: fflin.Robot,
-    allocate: bool | None,
-    law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
-) -> fflin.Robot:
-    """Return the robot of a design; for allocation, a base torque and force replace thrusters.
-
-    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base. A
-    given `law` must also command a base torque.
-    """
-    if allocate is None:
-        from fflin.control.authority import thrusters_give_every_wrench
-
-        of_wrench = law is None or "tau_b.x" in law.input_names
-        allocate = of_wrench and thrusters_give_every_wrench(robot)
-    if not allocate:
-        return robot
-    others = tuple(each for each in robot.inputs if not isinstance(each, fflin.Thruster))
-    if len(others) == len(robot.inputs):
-        raise InputError(
-            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
-            "--inputs"
+    check_pictures(robot, arguments)
+    policy, settings = loop_of(robot, arguments)
+    settings.pop("linear", None)  # the runs are not compared with a linear model
+    for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
+        settings[name] = getattr(arguments, name)
+    with going_on(path, "runs") as progress:
+        campaign = fflin.monte_carlo(
+            robot,
+            policy,
+            dispersions,
+            goals=arguments.goal,
+            histories=_ROWS if arguments.plot else 0,
+            progress=progress,
+            out=None if is_table else path,
+            overwrite=arguments.force,
+            **settings,
         )
-    present = {*map(type, others)}
-    missing = [kind() for kind in (fflin.BaseTorque, fflin.BaseForce) if kind not in present]
-    return robot.replace(inputs=(*missing, *others))
-
-
-def designed(
-    arguments: Namespace,
-) -> tuple[fflin.Robot, fflin.Robot, fflin.LinearModel, fflin.Gain]:
-    """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
-    robot = load_robot(arguments)
-    design = robot_of_design(robot, arguments.allocate)
-    _, lin = linear_model(arguments, design)
-    if arguments.reduce:
-        lin = fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
-    return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
-
-
-def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
-    """Return the weights of --q, --r and --bryson, or {} if none of these options is given."""
-    names = ("q", "r", "bryson")
-    given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
-    return given if any(given.values()) else {}
-
-
-def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
-    """Return the regulator of a model with the weights of the options; warn of small margins."""
-    from fflin.control.gain import fragility, one_sided
-    from fflin.control.lqr import require_fixed_point
-    from fflin.control.weights import rule_weights
-
-    require_fixed_point(lin)
-    if arguments.sample is not None:
-        lin = lin.discretize(arguments.sample)
-    given, speeds = weights_of(arguments), arguments.wheel_speeds
-    try:
-        *QRN, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
-    except UnknownNameError as error:
-        hint = "; --no-allocate weights single thrusters" * allocated
-        raise UnknownNameError(f"{error}{hint}") from None
-    gain = replace(fflin.lqr(lin, *QRN, wheel_speeds=speeds), weights=rule)
-    for text in filter(None, (fragility(gain), one_sided(gain))):
-        warnings.warn(text, FflinWarning, stacklevel=2)
-    return gain
-
-
-def schedule_of(
-    along: fflin.LinearTrajectory, arguments: Namespace, Qf: str | dict[str, float] = "steady"
-) -> fflin.GainSchedule:
-    """Return the time-varying regulator along a trajectory with the weights of the options."""
-    from fflin.control.default_weights import pace_along
-    from fflin.control.tvlqr import steady_end
-    from fflin.control.weights import rule_weights
-
-    sample, lin = arguments.sample, steady_end(along)
-    pace = pace_along(float(along.t[-1] - along.t[0]), sample or 0.0)
-    Q, R, _, rule = rule_weights(lin, arguments.weights, weights_of(arguments), pace=pace)
-    return fflin.tvlqr(along, Q, R, Qf, sample, rule=rule)
-
-
-def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
-    """Raise an error for invalid options of `pictures`, before a long simulation starts."""
-    from fflin.simulation.plan import LONGEST
-    from fflin.view.visualize import check_outputs, check_rates, check_times, tool_frame
-
-    if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
-        return
-    tool_frame(robot, arguments.tool)
-    duration = arguments.duration or LONGEST
-    check_rates(arguments.fps, arguments.speed, duration)
-    if arguments.times:
-        check_times(arguments.times, 0.0, duration)
-
-
-def pictures(
-    robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
-) -> dict[Path | None, Callable[[Path], object]]:
-    """Return {path: function that writes it} for the requested page and pictures of a motion."""
-    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
-
-    def show(path: Path) -> None:
-        fflin.visualize(robot, motion(), **how | {path.suffix.removeprefix("."): path})
-
-    return {getattr(arguments, name): show for name in _FILES}
-
-
-def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
-    """Return the policy that the arguments define, and keyword arguments of `simulate`."""
-    from fflin.simulation.plan import SHORTEST, time_to_settle
-
-    settings: dict[str, Any] = {
-        **{name: getattr(arguments, name) for name in ("dt", "method", "delay", "duration")},
-        "limits": limits_of_options(arguments),
+    worst = cache(lambda: campaign.replay(campaign.worst(1)[0]))
+    files = {
+        path: campaign.save if is_table else None,
+        arguments.plot: lambda file: fflin.plot_campaign(campaign, file),
+        **pictures(robot, worst, arguments),
     }
-    if not arguments.controller:
-        refuse(arguments, ("negative_feedback",), "only --controller has a sign of the feedback")
-    if arguments.trajectory or arguments.schedule:
-        design = robot_of_design(robot, bool(arguments.allocate))
-        tracking = along(design, arguments)
-        if offset := once("--offset", arguments.offset):
-            settings["q0"], settings["v0"] = tracking.beside(offset)
-        return fflin.Allocation(tracking, design) if arguments.allocate else tracking, settings
-    refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
-    if arguments.free:
-        of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
-        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
-        refuse(arguments, names, "with --free there is no regulator and all inputs are zero")
-        q, v = start_of(robot, arguments)
-        if arguments.duration is None:
-            settings["duration"] = SHORTEST
-        return None, settings | {"q0": q, "v0": v, "frame": arguments.frame}
-    policy, linear, lin = about_point(robot, arguments)
-    q, v = start_of(robot, arguments, linear.lin.reference)
-    if arguments.duration is None:
-        design = policy.design if isinstance(policy, fflin.Allocation) else robot
-        settings["duration"] = time_to_settle(design, linear, q, v)
-    return policy, settings | {"q0": q, "v0": v, "linear": lin}
+    notes = getattr(bound(policy, robot), "notes", ()) if policy else ()
+    shown = [str(campaign), *(folded([note]) for note in notes)]
+    text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
+    result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    return Report(robot.name, result, text, files)
 
 
-def start_of(
-    robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
-) -> tuple[Array, Array | None]:
-    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
-    point, number = robot.point, arguments.relative_equilibrium
-    if number:  # the start is relative to this pose, which replaces the pose of the point
-        point = {part: point[part] for part in ("joints", "velocity") if part in point}
-    rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
-    q, v = state_of(robot, arguments, point, {"velocity": rates}, robot.start)
-    if number:
-        import pinocchio as pin
+def validity(arguments: Namespace) -> Report:
+    """Find how far the robot can be displaced before the linear model or its regulator fails.
 
-        about = reference or attitude(robot, q, number, arguments.frame)[1]
-        q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
-    return q, v
-
-
-def about_point(
-    robot: fflin.Robot, arguments: Namespace
-) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
-    """Return the policy about a point, its linear feedback, and the model for the prediction.
-
-    The model is None for MPC, a reduced model, a controller from a file, or allocated thrusters.
-    `simulate` then predicts with the policy's own model, or not at all.
+    example: fflin validity ets_vii --attitude 120 --samples 200 --jobs 2
     """
-    gain: fflin.Gain | None = None
-    feedback: fflin.StateFeedback | fflin.LinearController
-    if arguments.mpc:
-        names = ("allocate", "gain", "controller", "reduce")
-        refuse(arguments, names, "--mpc replaces the regulator and its options")
-        arguments.allocate = False
-    if arguments.gain:
-        why = "the file of --gain already contains the weights and the operating point"
-        refuse(arguments, (*_WEIGHTS, *_TARGETS), why)
-        gain = fflin.Gain.load(arguments.gain)
-    design = robot_of_design(robot, arguments.allocate, gain)
-    if gain:
-        lin = _about_gain(design, gain, arguments)
-    else:
-        lin = model_about(design, arguments, *target_of(design, arguments))
-        if arguments.reduce:
-            lin = fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
-    if arguments.mpc:
-        by = _mpc(lin, arguments)
-        return by, fflin.StateFeedback(by.lin, by.gain.K), None
-    if arguments.controller:
-        of_gain = (*_WEIGHTS, "gain", "reduce")
-        refuse(arguments, of_gain, "--controller replaces the regulator and its options")
-        sign = -1.0 if arguments.negative_feedback else 1.0
-        feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
-    else:
-        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
-        feedback = fflin.StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+    robot, design, lin, gain = designed(arguments)
+    cut = arguments.limits == "urdf"
+    with closing(Progress()) as bar:
+        found = fflin.validity(
+            design,
+            lin.discretize(arguments.sample) if arguments.sample else lin,
+            gain,
+            attitude=arguments.attitude,
+            position=arguments.offset,
+            joint=arguments.spread,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            limits="urdf" if cut else None,
+            workers=arguments.jobs if arguments.jobs > 1 else None,
+            progress=bar,
+        )
+    text = str(found)
+    if cut or any(name in lin.limits for name in lin.input_names):
+        how = "not saturated; use --limits urdf to saturate them"
+        said = "saturated at the limits of the robot" if cut else how
+        text += f"\n{folded([f'inputs were {said}'])}"
     if design is not robot:
-        return fflin.Allocation(feedback, design), feedback, None
-    return feedback, feedback, None if arguments.reduce or arguments.controller else lin
+        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
+    files = {arguments.plot: lambda path: fflin.plot_validity(found, path)}
+    return Report(robot.name, found, text, files)
 
 
-def _mpc(lin: fflin.LinearModel, arguments: Namespace) -> Mpc:
-    """Return the predictive controller with the weights and limits of the arguments."""
-    from fflin.control.default_weights import Pace
-    from fflin.control.mpc import Mpc
-    from fflin.control.weights import rule_weights
+def funnel(arguments: Namespace) -> Report:
+    """Find the initial errors from which the regulator along a trajectory reaches a goal.
 
-    if (sample := arguments.sample) is None:
-        raise InputError("--mpc needs the sample time of the controller; add --sample H")
-    # Q and R weight a cost integral, because `lin` is in continuous time. Their default values
-    # depend on the sample time.
-    given = weights_of(arguments)
-    Q, R, *_ = rule_weights(lin, arguments.weights, given, pace=Pace(hold=sample))
-    limits = limits_of_options(arguments)
-    by = fflin.mpc(lin, Q, R, horizon=arguments.horizon, dt=sample, limits=limits)
-    assert isinstance(by, Mpc)  # since the model is about a point
-    return by
-
-
-def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
-    """Return the feedback along the trajectory of --trajectory or --schedule."""
-    regulator = ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS)
-    why = (
-        "the trajectory defines the regulator, its target, and the start, which --offset displaces"
-    )
-    refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
-    if arguments.schedule is None:
-        models = models_along(arguments, robot)
-        return fflin.TrajectoryFeedback(models, schedule_of(models, arguments))
-    why = "the file of --schedule already contains the trajectory and the design of its gains"
-    refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
-    schedule = fflin.GainSchedule.load(arguments.schedule)
-    return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
-
-
-def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
-    """Return the linear model about the point for which a gain was designed.
-
-    If the base is at the reference of the gain, the target pose of the base is the new reference.
+    example: fflin funnel arm.toml --schedule gains.npz --goal attitude=1
     """
+    if arguments.trajectory is None and arguments.schedule is None:
+        raise InputError("neither --trajectory nor --schedule is given; give one of them")
+    robot = load_robot(arguments)
+    policy = along(robot, arguments)
+    with closing(Progress()) as bar:
+        found = fflin.funnel(
+            robot,
+            policy,
+            once("--goal", arguments.goal),
+            within=once("--within", arguments.within),
+            limits=limits_of_options(arguments),
+            progress=bar,
+            **{name: getattr(arguments, name) for name in _RUNS},
+        )
+    files = {
+        arguments.plot: lambda path: fflin.plot_funnel(found, path),
+        arguments.output_file: found.save,
+    }
+    return Report(robot.name, found, str(found), files)
+
+
+def sweep(arguments: Namespace) -> Report:
+    """Linearise about many points and save all models.
+
+    example: fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5
+    """
+    from fflin.batch.files import part_of
+    from fflin.batch.sweep import ChunkJob
+
+    path, robot = arguments.output_file, load_robot(arguments)
+    settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
+    linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
+    size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
+    part = part_of(path)
+    resuming = f", resuming from {part}" * part.exists()
+    needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
+    said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
+    print(f"fflin: {said}", file=sys.stderr)  # all options are valid
+    with going_on(path, "points") as progress:
+        work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
+        batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
+    states, inputs = len(batch.state_names), len(batch.input_names)
+    text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
+    names = ("state_names", "state_units", "input_names", "input_units", "frame")
+    result = {"points": len(batch), **{name: getattr(batch, name) for name in names}}
+    return Report(robot.name, result, text, {path: None})
+
+
+def _points(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[Configurations, Array | None, Array | None]:
+    """Return the configurations q of a sweep, and the v and u that all its points share."""
+    import numpy as np
     import pinocchio as pin
 
-    from fflin.control.gain import model_of
+    from fflin.robot.joints import by_joint
 
-    if gain.x0[:6].any():
-        refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
-        pose = gain.placement
-    else:
-        pose = target_of(robot, arguments)[0][:7]
-    linear = partial(model_of, gain, robot, f"{arguments.gain} was made for '{gain.robot}'")
-    lin = linear(pin.XYZQUATToSE3(pose))
-    if number := arguments.relative_equilibrium:
-        return linear(attitude(robot, lin.q, number, lin.frame)[1])
-    return lin
+    if bool(arguments.grid) == (arguments.random is not None):
+        raise InputError("a sweep needs exactly one of --grid and --random; give one of them")
+    if arguments.range and arguments.random is None:
+        raise InputError("--range needs --random; --grid has its own ranges")
+    q, v = state_of(robot, arguments, robot.point)
+    u = fflin.effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    fixed = once("--joint", arguments.joint)
+    base = robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
+    if arguments.random is not None:
+        ranges = once("--range", arguments.range)
+        ranges |= {name: (value, value) for name, value in fixed.items()}
+        drawn = {"seed": arguments.seed, "ranges": ranges, "base": base}
+        return fflin.random_configurations(robot, arguments.random, **drawn), v, u
+    axes = once("--grid", arguments.grid)
+    for name in axes:
+        robot.joint(name)
+    values = {name: np.linspace(*axis) for name, axis in axes.items()}
+    joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
+    others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
+    return fflin.grid(robot, values, joints=others, base=base), v, u
 
 
-def target_of(
-    robot: fflin.Robot, arguments: Namespace
-) -> tuple[Array, Array | None, pin.SE3 | None]:
-    """Return q (nq,), v (nv,) and reference of the target; the default is the operating point."""
-    return point_of(robot, arguments, robot.point, robot.target, prefix="target_")
+@contextmanager
+def going_on(path: Path | None, what: str) -> Iterator[Progress]:
+    """Show a progress bar; after Ctrl-C, report the progress and how to resume."""
+    from fflin.batch.files import part_of
+
+    bar = Progress()
+    try:
+        yield bar
+    except KeyboardInterrupt:
+        said = f"stopped at {bar.done:,} of {bar.total:,} {what}" if bar.total else "stopped"
+        if not path:
+            said += "; nothing is saved without -o FILE"
+        elif part_of(path).exists():
+            said += f"; the same command resumes from {part_of(path)}"
+        raise KeyboardInterrupt(said) from None
+    finally:
+        bar.close()

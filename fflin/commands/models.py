@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import textwrap
 import warnings
 from argparse import Namespace
@@ -16,7 +17,9 @@ from fflin.base.names import runs
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals, width
 from fflin.base.writing import check_ending, check_output_path, write_atomically
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.points import (
+from fflin.commands.builders import (
+    SHOWN,
+    Report,
     linear_model,
     load_robot,
     models_along,
@@ -25,7 +28,6 @@ from fflin.commands.points import (
     refuse,
     state_of,
 )
-from fflin.commands.results import Report
 
 # Entries of f0 [SI] below this value count as zero.
 _MOVES = 1e-9
@@ -126,6 +128,25 @@ def init(arguments: Namespace) -> Report:
         f"simulate {target}"
     )
     return Report(robot.name, {}, text, {target: None})
+
+
+def view(arguments: Namespace) -> Report:
+    """Show a robot live in the browser with a slider for each joint.
+
+    example: fflin view servicer_7dof --joint joint_2=0.4
+    """
+    from fflin.view.live import Live
+
+    robot = load_robot(arguments)
+    q, _ = state_of(robot, arguments, robot.point, robot.start)
+    how = {name: getattr(arguments, name) for name in (*SHOWN, "frame")}
+    live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
+    assert isinstance(live, Live)  # since there is no motion
+    print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    if not arguments.no_open:
+        live.open()
+    live.wait()
+    return Report(robot.name, {}, f"{robot.name}: the view is closed")
 
 
 def linearize(arguments: Namespace) -> Report:
@@ -299,7 +320,7 @@ def equilibrium(arguments: Namespace) -> Report:
 
     refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
     robot = load_robot(arguments)
-    q, v, reference = point_of(robot, arguments, robot.point)
+    q, v, reference = point_of(robot, arguments)
     axes = {"frame": arguments.frame, "reference": reference}
     held = fflin.equilibrium(robot, q, v=v, **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)

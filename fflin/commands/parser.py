@@ -16,6 +16,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from fflin.base.errors import FflinWarning, one_line
 from fflin.commands import BAD_INPUT
+from fflin.commands.options import ABOUT, COMMON, DESCRIPTIONS, OPTIONS, OUTPUT
 
 
 def number(text: str) -> float:
@@ -77,9 +78,7 @@ class OutputFile:
 
 def assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE."""
-    name, separator, value = text.rpartition("=")
-    if not separator or not name:
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form NAME=VALUE")
+    name, (value,) = _parts(text, "NAME=VALUE", 1)
     return name, number(value)
 
 
@@ -103,21 +102,17 @@ def orbit(text: str) -> dict[str, float | str]:
 
 def parameter_range(text: str) -> tuple[str, object]:
     """Read NAME=FRACTION or NAME=LEAST:LARGEST, either of which may end with ",tied"."""
-    name, _, value = text.rpartition("=")
-    tied = value.endswith(",tied")
-    ends = value.removesuffix(",tied").split(":")
-    if not name or len(ends) > 2:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is not of the form NAME=FRACTION or NAME=LEAST:LARGEST"
-        )
+    name, ends = _parts(text, "NAME=FRACTION or NAME=LEAST:LARGEST", 1, 2)
+    tied = ends[-1].endswith(",tied")
+    ends[-1] = ends[-1].removesuffix(",tied")
     found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
     return name, {"range": found, "tied": True} if tied else found
 
 
 def grid_axis(text: str) -> tuple[str, tuple[float, float, int]]:
     """Read JOINT=LO:HI:N."""
-    name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
-    low, high, count = *map(number, parts[:2]), count_of(parts[2])
+    name, (*ends, points) = _parts(text, "JOINT=LO:HI:N, such as joint_1=-1:1:21", 3)
+    low, high, count = *map(number, ends), count_of(points)
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)
@@ -125,16 +120,16 @@ def grid_axis(text: str) -> tuple[str, tuple[float, float, int]]:
 
 def joint_range(text: str) -> tuple[str, tuple[float, float]]:
     """Read JOINT=LO:HI."""
-    name, (low, high) = _parts(text, "JOINT=LO:HI", "joint_1=-1:1")
+    name, (low, high) = _parts(text, "JOINT=LO:HI, such as joint_1=-1:1", 2)
     return name, (number(low), number(high))
 
 
-def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
-    """Split JOINT=A:B:... into the name and its values; their number must be as in `form`."""
+def _parts(text: str, form: str, *counts: int) -> tuple[str, list[str]]:
+    """Split NAME=A:B:... into the name and its values; their number must be one of `counts`."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
-    if not name or len(parts) != len(form.split(":")):
-        raise argparse.ArgumentTypeError(f"'{text}' is not of the form {form}, such as {example}")
+    if not name or len(parts) not in counts:
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form {form}")
     return name, parts
 
 
@@ -157,6 +152,11 @@ def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
     return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
 
 
+def _saved(*kinds: str, endings: tuple[str, ...] = (".npz", ".mat", ".json")) -> Form:
+    """Return the form of -o for results of some kinds."""
+    return one(OutputFile(endings, kinds), "FILE")
+
+
 _PAIRS = many(assignment, "NAME=VALUE")
 _WEIGHTS = many(assignment, "NAME=W")
 _OF_JOINT = many(joint_or_all, "[NAME=]VALUE")
@@ -164,8 +164,12 @@ _NAMES = many(str, "NAME")
 _ANGLES, _AXES = one(number, ("R", "P", "Y")), one(number, ("X", "Y", "Z"))
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
+_FORMER: Form = {**_TIME, "dest": "former_dt"}
+_UNSATURATED: Form = {"choices": ("urdf", "none"), "default": "none"}
+_TABLE = (".npz", ".mat", ".json", ".csv")
 
-# {option or ARGUMENT: form of its value}. Options that are not listed are switches.
+# {option or ARGUMENT: form of its value}. A key "COMMAND OPTION" is for a single command. Options
+# that are not listed are switches.
 FORMS: dict[str, Form] = {
     "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
     "URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"},
@@ -212,41 +216,34 @@ FORMS: dict[str, Form] = {
     **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
     "plot": one(OutputFile((".png", ".pdf", ".svg")), "FILE"),
     **{ending: one(OutputFile((f".{ending}",)), "FILE") for ending in ("html", "png", "gif")},
+    "init output-file": _saved(endings=(".toml",)),
+    "view frame": {"choices": ("lvlh", "hill")},
+    "linearize output-file": _saved("LinearModel", "LinearTrajectory", "ToolModel", endings=_TABLE),
+    "equilibrium output-file": _saved("Equilibrium"),
+    "sensitivity output-file": _saved("Sensitivity"),
+    "uncertain output-file": _saved("LFT"),
+    **dict.fromkeys(("validity dt", "lqr dt", "tvlqr dt"), _FORMER),
+    **dict.fromkeys(("validity limits", "export limits"), _UNSATURATED),
+    "validity offset": one(number, "X", 0.5),
+    "funnel knots": one(count_of, "N", 10),
+    "funnel output-file": _saved("Funnel"),
+    "lqr output-file": _saved("Gain"),
+    "tvlqr trajectory": {**_FILE, "required": True},
+    "tvlqr output-file": _saved("GainSchedule"),
+    "plan duration": one(number, "T", required=True),
+    "plan hold": {"choices": ("linear", "previous"), "default": "previous"},
+    "plan output-file": _saved("Trajectory", "Motion", endings=_TABLE),
+    "simulate output-file": _saved("Motion", endings=_TABLE),
+    "sweep output-file": {**_saved("LinearBatch", endings=(".npz", ".h5")), "required": True},
+    "montecarlo goal": many(str, "CONDITION"),
+    "montecarlo output-file": _saved(endings=(".npz", ".h5", ".csv", ".mat")),
 }
 
 _REPEATABLE = " (repeatable)"
-_FORCE = (
-    "replace the file of -o, whatever it contains. Without --force, -o replaces only a file that "
-    "contains a result of the same kind"
-)
 
 
 class Command(argparse.ArgumentParser):
     """Parser of a command that reports errors in one line."""
-
-    def add(self, title: str, options: Mapping[str, str], forms: Mapping[str, Form]) -> None:
-        """Add a group of `options` {name: help}, whose values have the `forms` {name: form}."""
-        groups = {"": self, **{each.title: each for each in self._action_groups}}
-        group = groups.get(title) or self.add_argument_group(title)
-        for name, about in options.items():
-            if not name:
-                group.description = about
-                continue
-            text = about
-            form = forms.get(name, {"action": "store_true"})
-            reader, default = form.get("type"), form.get("default")
-            if isinstance(reader, OutputFile):
-                text = text.replace("FILE", f"FILE: {reader}")
-            elif form.get("action") == "append":
-                text += _REPEATABLE
-            elif default is not None and reader in (number, count_of, whole):
-                text += f"; {default:g} by default"
-            flags = [] if name.isupper() else [f"--{name}"]
-            if name.startswith("output-f"):
-                flags.insert(0, "-o")
-            group.add_argument(*flags, help=text, **form)
-            if isinstance(reader, OutputFile) and reader.kinds:
-                group.add_argument("--force", help=_FORCE, action="store_true")
 
     def _print_message(self, message: str, file: object = None) -> None:
         # Print the text here, because argparse would ignore an error in writing it.
@@ -259,6 +256,49 @@ class Command(argparse.ArgumentParser):
             message += '"base.mass" = 0.05'
         print_error(f"fflin: error: {message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
+
+
+def add_command(
+    commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], object]
+) -> None:
+    """Add a command and its options. The function `run` executes the command and gives its name.
+
+    The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
+    the options in `COMMON`; ``--help all`` lists all options.
+    """
+    name, (summary, _, example) = run.__name__, (run.__doc__ or "").partition("\n\n")
+    command = commands.add_parser(
+        name,
+        add_help=False,
+        help=summary[:1].lower() + summary[1:].removesuffix("."),
+        description=summary,
+        epilog=example,
+    )
+    # A negative number such as -1e-3 is a value, not an option.
+    command._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+    about = "show help for the common options; --help all shows help for all options"
+    command.add_argument("-h", "--help", nargs="?", metavar="all", action=Help, help=about)
+    command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
+    for title, options in ((OUTPUT, "json"), *OPTIONS[name].items()):
+        groups = {"": command, **{each.title: each for each in command._action_groups}}
+        group = groups.get(title) or command.add_argument_group(title, DESCRIPTIONS.get(title))
+        for option in options.split():
+            own = f"{name} {option}"
+            text = ABOUT.get(own) or ABOUT[option]
+            form = FORMS.get(own) or FORMS.get(option, {"action": "store_true"})
+            reader, default = form.get("type"), form.get("default")
+            if isinstance(reader, OutputFile):
+                text = text.replace("FILE", f"FILE: {reader}")
+            elif form.get("action") == "append":
+                text += _REPEATABLE
+            elif default is not None and reader in (number, count_of, whole):
+                text += f"; {default:g} by default"
+            flags = [] if option.isupper() else [f"--{option}"]
+            if option.startswith("output-f"):
+                flags.insert(0, "-o")
+            group.add_argument(*flags, help=text, **form)
+            if isinstance(reader, OutputFile) and reader.kinds:
+                group.add_argument("--force", help=ABOUT["force"], action="store_true")
 
 
 def print_error(line: str) -> None:
@@ -307,18 +347,6 @@ def short_help(command: argparse.ArgumentParser) -> str:
     return formatter.format_help()
 
 
-def files_of(arguments: argparse.Namespace) -> tuple[list[Path], list[tuple[Path, OutputFile]]]:
-    """Return the input files in the arguments, and the output files with their readers."""
-    inputs, outputs = list[Path](), list[tuple[Path, OutputFile]]()
-    for action in arguments.command._actions:
-        value = getattr(arguments, action.dest, None)
-        if value is not None and isinstance(action.type, OutputFile):
-            outputs.append((value, action.type))
-        elif value is not None and action.type in (input_file, input_name):
-            inputs.append(Path(value))
-    return inputs, outputs
-
-
 def settle_former_names(arguments: argparse.Namespace) -> None:
     """Accept the former names --step and --dt of --dt and --sample, with a warning."""
     if (step := getattr(arguments, "step", None)) is not None:
@@ -327,8 +355,9 @@ def settle_former_names(arguments: argparse.Namespace) -> None:
             said += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = step
-        warnings.warn(said, FflinWarning, stacklevel=2)
     elif (sample := getattr(arguments, "former_dt", None)) is not None:
         said = f"--dt has the new name --sample; write --sample {sample:g}"
         arguments.sample = sample
-        warnings.warn(said, FflinWarning, stacklevel=2)
+    else:
+        return
+    warnings.warn(said, FflinWarning, stacklevel=2)

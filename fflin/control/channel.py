@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,8 @@ from fflin.robot.fields import Range, input_limits, pulsed_thrusters
 from fflin.robot.inputs import named_inputs
 from fflin.robot.robot import Robot
 
+Inputs: TypeAlias = Callable[..., Array]
+
 
 class Saturation(NamedTuple):
     """Input limits, wheel speed limits and thruster pulses that change the commands."""
@@ -25,8 +27,13 @@ class Saturation(NamedTuple):
     low: Array  # (nu,)
     high: Array
     wheels: Wheels = empty(WHEELS)
-    wheel_names: tuple[str, ...] = ()  # in the order of `wheels`
     pulses: Pulses = empty(PULSES)
+
+    @property
+    def cuts(self) -> bool:
+        """Whether the applied inputs may differ from the command."""
+        limited = bool(np.isfinite((self.low, self.high)).any())
+        return limited or len(self.wheels.at) + len(self.pulses.at) > 0
 
 
 def saturation(
@@ -53,7 +60,7 @@ def saturation(
             most_speed=most_speed,
             stiffness=1.0 / (mobility * dt),
         )
-        within = within._replace(wheels=wheels, wheel_names=tuple(spun))
+        within = within._replace(wheels=wheels)
     if not (pulsed and (thrusters := pulsed_thrusters(robot))):
         return within
     at, time = list(thrusters), sample * dt
@@ -163,39 +170,24 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
     return channel
 
 
-class Channel:
-    """Channel from the commands of `law` to the applied inputs, computed by the kernel's functions.
+def channelled(
+    law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
+) -> Inputs:
+    """Return the function f(step, *point) of the inputs that a channel applies in a step.
 
-    `law` and `speeds` are called with the arguments `point` of `begin`. `speeds` returns the
-    speeds (k,) of the wheels whose speed is limited.
+    `law` and `speeds` are called with the arguments `point`. `speeds` returns the speeds (k,) of
+    the wheels whose speed is limited.
     """
+    wheels, u = len(limits.wheels.at), initial.copy()
+    if not (sample or wheels or np.isfinite((limits.low, limits.high)).any()):
+        return lambda _, *point: law(*point)
+    within = limits._replace(wheels=limits.wheels._replace(row=np.arange(wheels)))
+    channel = channel_of(within, initial, sample, delay)
 
-    def __init__(
-        self,
-        law: Callable[..., Array],
-        initial: Array,
-        limits: Saturation,
-        sample: int,
-        delay: int,
-        speeds: Callable[..., Array],
-    ) -> None:
-        self._law, self._speeds, self._u = law, speeds, initial.copy()
-        self._wheels, self._pulses = len(limits.wheels.at), len(limits.pulses.at)
-        self._limited = bool(np.isfinite((limits.low, limits.high)).any())
-        wheels = limits.wheels._replace(row=np.arange(self._wheels))
-        self._rules = channel_of(limits._replace(wheels=wheels), initial, sample, delay)
+    def applied(step: int, *point: object) -> Array:
+        if rules.is_asked(channel, step):
+            u[:] = law(*point)
+        rules.transmit(channel, step, speeds(*point) if wheels else u[:0], u)
+        return u.copy()
 
-    @property
-    def cuts(self) -> bool:
-        """Whether the applied inputs may differ from the command."""
-        return bool(self._limited or self._wheels or self._pulses)
-
-    def begin(self, step: int, *point: object) -> Array:
-        """Return the applied inputs at the start of a step."""
-        if not (self._rules.sample or self._limited or self._wheels):
-            return self._law(*point)
-        if rules.is_asked(self._rules, step):
-            self._u[:] = self._law(*point)
-        speeds = self._speeds(*point) if self._wheels else self._u[:0]
-        rules.transmit(self._rules, step, speeds, self._u)
-        return self._u.copy()
+    return applied

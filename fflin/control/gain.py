@@ -19,7 +19,7 @@ from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.state import Actuation, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
 from fflin.linear.model import ControlSystem, LinearModel, state_space
 
@@ -142,7 +142,7 @@ class Gain(ModelDesign):
         more = {
             "not regulated": f"{listed(left)} {why}" if left else "",
             "weights": self.weights,
-            "warning": "; ".join(filter(None, (fragility(self), one_sided(self)))),
+            "warning": "; ".join(cautions(self)),
         }
         fold = partial(textwrap.fill, width=width())
         rates, margins = rates_of(self.poles, self.dt), self.margins
@@ -232,9 +232,8 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
 
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
-    for kind, there in (("state", state), ("input", Actuation(state))):
-        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
-        require_same(made, robot, kind, own, (there.names, there.units))
+    require_same(made, state, "state", gain.state_names, gain.state_units)
+    require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
@@ -264,37 +263,30 @@ def make_gain(
     )
 
 
-def fragility(gain: Gain) -> str:
-    """Return a warning if the disk margin at the inputs is small, or an empty string."""
-    margins = gain.margins
-    if margins.disk >= _FRAGILE:
-        return ""
-    remedy = (
-        "shorten dt, or slow the loop as the default weights do"
-        if gain.dt
-        else "give a diagonal R, such as the R of the default weights"
-    )
-    return (
-        f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
-        f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
-        f"unstable; {remedy}"
-    )
-
-
-def one_sided(gain: Gain) -> str:
-    """Return a warning if a gain commands negative thrust, or an empty string."""
+def cautions(gain: Gain) -> list[str]:
+    """Return warnings of a small disk margin at the inputs, and of negative thrust."""
+    said, margins = list[str](), gain.margins
+    if margins.disk < _FRAGILE:
+        remedy = "give a diagonal R, such as the R of the default weights"
+        if gain.dt:
+            remedy = "shorten dt, or slow the loop as the default weights do"
+        said.append(
+            f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
+            f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
+            f"unstable; {remedy}"
+        )
     keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
         name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
-    if not thrusters:
-        return ""
-    return (
-        f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so the "
-        "poles and margins do not hold; design with torque and force on the base, and allocate "
-        "them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin simulate` do so by "
-        "default if the thrusters can push in every direction"
-    )
+    if thrusters:
+        said.append(
+            f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so "
+            "the poles and margins do not hold; design with torque and force on the base, and "
+            "allocate them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin "
+            "simulate` do so by default if the thrusters can push in every direction"
+        )
+    return said
 
 
 def _poles(gain: Gain) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FileError, InputError, listed, unknown
+from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
 from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
@@ -164,9 +164,8 @@ class LinearController(Feedback):
         """Sampling time [s]; 0 in continuous time."""
         return float(self.system.dt)
 
-    @property
-    def terms(self) -> Sample:
-        """Matrices and offsets that apply at each sample or Runge-Kutta stage."""
+    def terms(self, _: float = 0.0) -> Sample:
+        """Return the matrices and offsets, which are the same at all times."""
         (A, B, C, D, *_), lin = self.system, self.lin
         return Sample(A, B, C, D, lin.u0, lin.y0)
 
@@ -178,15 +177,14 @@ class LinearController(Feedback):
         InputError
             If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
-        lin, stays = self.lin, self.terms
-        state = self.state_map(robot)
-        require_sensed(lin, robot, state)
-        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
-        return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
+        lin, terms, state = self.lin, self.terms(), self.state_map(robot)
+        require_sensed(lin, state)
+        always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
+        return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
         """Return the model with the controller's states added, and K and u of the law u + K e."""
-        A, B, C, D, u0, y0, *_ = self.terms
+        A, B, C, D, u0, y0, *_ = self.terms()
         apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
             lin,
@@ -365,10 +363,8 @@ def _read(path: Path) -> System:
             "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
-    try:
+    with located(str(path)):
         return _checked(A, B, C, D, dt, inputs, outputs)
-    except FflinError as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def _indices(

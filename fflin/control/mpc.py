@@ -17,7 +17,7 @@ from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, num
 from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Clock, Deviation, Feedback, Policy, StateFeedback
+from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
 from fflin.control.weights import Weight, sampled_cost, weight
@@ -420,7 +420,7 @@ class Receding:
     """
 
     def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
-        self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
+        self.of, self._at, self._last = horizon, at, -np.inf
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.unfinished = 0
         # For each kind of soft-limit violation: the number of violations, and the magnitude and
@@ -448,7 +448,7 @@ class Receding:
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
-        self._clock.tick(t)
+        self._last = next_sample(t, self._last, self.of.dt)
         assert self._at is not None
         u, e = self._at(t, q, v)
         command: Array = u + self.step(t, e)

@@ -213,10 +213,8 @@ def _least(search: Search) -> _Made:
         if shooting.held:
             u = np.vstack((u[:-1], u[-2]))  # the last row repeats the input of the last interval
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
-        every = max(1, shooting.steps // _PARTS)
-        fine = shooting.motions(q, v, u, every * _PARTS)
-        points = (each[:, every::every] for each in fine[:2])
-        beyond = excess(bounds[:, None, None] - shooting.limited_values(*points))
+        within = shooting.inside(shooting.motions(q, v, u), _PARTS)
+        beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
         made = _Made(q, v, u, missed, at_knots, beyond, float(beyond.max()))

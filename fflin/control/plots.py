@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, Axes, Figure, cycle, drawing, letters_of, logarithmic
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
-from fflin.base.validation import Array, Mask, Values, instance, number, refuse_masked
+from fflin.base.validation import Array, Mask, Values, dimension, instance, number, refuse_masked
 from fflin.control.gain import Gain
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
@@ -386,12 +386,8 @@ def _poles_of(given: object) -> tuple[Values, float]:
     if hasattr(given, "poles"):
         return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
     refuse_masked("poles", given)
-    try:
-        poles = np.asarray(given)
-    except ValueError:
-        poles = np.asarray(None)  # its rows differ in length
-    right = poles.dtype.kind in "fiuc" and poles.ndim == 1 and poles.size
-    if not right or not np.isfinite(poles).all():
+    flat, poles = dimension("poles", given) == 1, np.asarray(given)
+    if not (flat and poles.dtype.kind in "fiuc" and poles.size and np.isfinite(poles).all()):
         raise InputError(
             f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "
             "numbers (k,), a Gain, a LinearModel or {label: poles}"

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
@@ -53,9 +54,9 @@ class Feedback:
     def deviation(self, robot: Robot) -> Deviation:
         """Return a function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
-        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
-        near[fed] = lin.x0
-        return lambda _, q, v: (lin.u0, state.read(q, v, near=near)[fed] - lin.x0)
+        S = selection(lin.state_names, state.names)
+        near = S.T @ lin.x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
 
 
 @dataclass(eq=False)
@@ -102,13 +103,8 @@ class StateFeedback(Feedback):
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin = self.lin
-        fed = np.array([state.names.index(name) for name in lin.state_names])
-        near = np.zeros(state.nx)
-        near[fed] = lin.x0
-        K = np.zeros((len(self.K), state.nx))
-        K[:, fed] = self.K
-        return K, lin.u0 + self.K @ lin.x0, near
+        lin, S = self.lin, selection(self.lin.state_names, state.names)
+        return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -152,11 +148,6 @@ class Allocation:
 
     policy: object
     design: Robot
-
-    @property
-    def lin(self) -> LinearModel | None:
-        """Linear model that the policy was designed for, or None if the policy has none."""
-        return getattr(self.policy, "lin", None)
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -219,21 +210,18 @@ class AllocatedPolicy:
         return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
 
 
-class Clock:
-    """Check that a controller with an internal state is called once per sample time `dt` [s]."""
+def next_sample(t: float, last: float, dt: float) -> float:
+    """Return t, or raise `InputError` unless t is one sample time `dt` [s] after the last sample.
 
-    def __init__(self, dt: float) -> None:
-        self._dt, self._last = dt, -np.inf
-
-    def tick(self, t: float) -> None:
-        """Raise `InputError` if t is not one sample time after the last sample."""
-        apart = t - self._last
-        if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
-            raise InputError(
-                f"the controller is called {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave out `sample`, or set `sample` to the expected value"
-            )
-        self._last = t
+    `last` is negative before the first sample.
+    """
+    apart = t - last
+    if last >= 0.0 and abs(apart - dt) > 1e-6 * dt:
+        raise InputError(
+            f"the controller is called {apart:g} s after its last sample, expected "
+            f"{dt:g} s; leave out `sample`, or set `sample` to the expected value"
+        )
+    return t
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
@@ -255,6 +243,13 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
     return found, gyros
 
 
+# Function of the command u that returns the outputs y.
+Measure: TypeAlias = Callable[[Array], Array]
+
+# Function of a controller's state z that returns the command, and the next z or dz/dt.
+Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
+
+
 class Sample(NamedTuple):
     """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
 
@@ -270,8 +265,8 @@ class Sample(NamedTuple):
     y0: Array
     jump: Array | float = 0.0
 
-    def step(self, z: Array, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
+    def step(self, z: Array, measure: Measure) -> tuple[Array, Array]:
+        """Return the command, and the next z or dz/dt."""
         z = z + self.jump
         u: Array = self.u0 + self.C @ z
         if self.D.any():  # acts on outputs that do not depend on u
@@ -282,48 +277,42 @@ class Sample(NamedTuple):
 class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
-    The compensator's state z advances at each sample, or at each stage if dt is 0.
+    The compensator's state z advances at each sample, or at each stage if dt is 0. ``at(t)``
+    returns the compensator's step, the robot's outputs, and the state near which angles are
+    unwrapped. `sizes` are the sizes of z and y.
     """
 
     def __init__(
         self,
         state: StateMap,
         dt: float,
-        noise: Callable[[float], ArrayLike] | None,
-        size: int,
-        at: Callable[[float], Any],
-        there: Callable[[float], tuple[Measuring, Array]],
+        sizes: tuple[int, int],
+        at: Callable[[float], tuple[Step, Measuring, Array]],
+        noise: Callable[[float], ArrayLike] | None = None,
     ) -> None:
-        self.at, self.dt = at, dt
-        self.estimate: Array = np.zeros(size)  # z at the next sample or stage
+        self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
+        self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
         self.rates: list[Array] = [self.estimate]
-        self.stages = 0
-        self._noise, self._there = noise, there
+        self.stages, self._last = 0, -np.inf
         self._at_rest: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
-
-    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
-        """Return the law at time t, and the chart and state relative to which y is measured."""
-        measure, near = self._there(t)
-        return self.at(t), measure.state, near
+        self._aba = Aba(state) if felt else None
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or at a stage of the integrator."""
         if self.dt:
-            self._clock.tick(t)
+            self._last = next_sample(t, self._last, self.dt)
         elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
                 "only fflin.simulate can integrate the states of a continuous controller; pass "
                 "the LinearController itself to fflin.simulate as the policy, or sample the "
                 "controller"
             )
-        measure, near = self._there(t)
+        step, measure, near = self.at(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
         noise: Array | float = 0.0
         if self._noise is not None:
-            size = len(self.at(t).y0)
-            noise = vector("noise(t)", self._noise(t), size, "one value for each output")
+            noise = vector("noise(t)", self._noise(t), self._ny, "one value for each output")
 
         def measured(u: Array) -> Array:
             a = self._at_rest
@@ -331,17 +320,12 @@ class Loop:
                 a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
             return np.asarray(measure(x, q, v, a) + noise)
 
-        u, after = self.step(t, measured)
+        u, after = step(self.estimate, measured)
         if self.dt:
             self.estimate = after
         else:
             self.rates.append(after)
         return u
-
-    def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command, and the next z or dz/dt; `measure(u)` returns y."""
-        found: tuple[Array, Array] = self.at(t).step(self.estimate, measure)
-        return found
 
     def advance(self, weights: Array, last: bool) -> None:
         """Set z at the next stage to the weighted sum of the step's first z and its rates."""
@@ -378,8 +362,9 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
     """Return the model and the gain K of a policy; each is None if the policy has none."""
-    lin = getattr(policy, "lin", None)
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
+    by = decider(policy)
+    lin = getattr(by, "lin", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:

@@ -17,8 +17,8 @@ from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy
 from fflin.control.tvlqr import FilterSchedule, GainSchedule, resting_end, steady_regulator
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Actuation, Frame, StateMap
-from fflin.linear.fit import require_same, require_turns, sensed
+from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.fit import require_same, require_turns, signals_of
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
@@ -171,8 +171,8 @@ class TrajectoryFeedback(Feedback):
         origin = self.trajectory.robot
         state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
-        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
-            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
+        for kind in ("input", "state"):
+            require_same(made, state, kind, *signals_of(own, kind))
         require_turns(made, origin.nq, robot)
         return state
 
@@ -304,16 +304,17 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             If the robot has other states, inputs or outputs than the trajectory.
         """
         origin, home = self.trajectory.robot, self.state_map(robot)
-        own = sensed(StateMap(origin, frame="local"))
         made = f"the trajectory was made for '{origin.name}'"
-        require_same(made, robot, "output", own, sensed(home))
+        own = signals_of(StateMap(origin, frame="local"), "output")
+        require_same(made, home, "output", *own)
 
         def there(t: float) -> tuple[Measuring, Array]:
             q, v, _ = self.reference(t)
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
-        return Loop(home, self.filter.dt, self.noise, home.nx, self._sample, there)
+        dt, sizes = self.filter.dt, self.filter.L.shape[1:]
+        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *there(t)), self.noise)
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
@@ -321,15 +322,13 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         lin, seen = self.end.discretize(self.filter.dt), self.filter
         return lin, kalman(lin, seen.W[-1], seen.V).L
 
-    def _sample(self, t: float) -> Sample:
-        gains, seen, dt = self.schedule, self.filter, self.filter.dt
-        k, jump = round(t / dt), np.zeros(len(seen.state_names))
+    def terms(self, t: float) -> Sample:
+        """Return the matrices and offsets of the sample at time t."""
+        gains, seen = self.schedule, self.filter
+        k, jump = round(t / seen.dt), np.zeros(len(seen.state_names))
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
-            # A held input approximates a changing input best with the value at the middle of the
-            # sample.
-            u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
-            y = seen.y[k]
+            u, y = self.commanded(t)[2], seen.y[k]
         else:
             (lin, L), K = self._rest, self.end_gain
             A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0

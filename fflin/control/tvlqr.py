@@ -22,7 +22,7 @@ from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import held_cost
-from fflin.dynamics.state import Actuation, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.fit import require_same
 from fflin.linear.linear_trajectory import LinearTrajectory, transitions
@@ -123,9 +123,8 @@ class GainSchedule(Schedule):
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that the gains were designed for."""
         state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
-        inputs = Actuation(state).names
-        require_same(made, robot, "state", (self.state_names,) * 2, (state.names,) * 2)
-        require_same(made, robot, "input", (self.input_names,) * 2, (inputs,) * 2)
+        require_same(made, state, "state", self.state_names, None)
+        require_same(made, state, "input", self.input_names, None)
         parts = self.knots, self.q, self.v, self.u
         return Trajectory(robot, *parts, hold=self.hold, frame=self.frame)
 
@@ -172,7 +171,7 @@ class GainSchedule(Schedule):
             pieces[power : power + 4] += reach @ self._cubics.c[::-1]
         return pieces.swapaxes(0, 1).reshape(len(self.t) - 1, 7, -1)
 
-    def defect(self, at: Callable[[Array], riccati.Coefficients]) -> float:
+    def defect(self, at: Callable[[Array], Array]) -> float:
         """Return the largest relative residual of the differential equation between knots."""
         middle = 0.5 * (self.t[:-1] + self.t[1:])
         P, rate = self._cubics(middle), self._cubics(middle, 1)
@@ -331,9 +330,9 @@ def tvlqr(
     Q, R, _ = cost_weights(traj, Q, R, None)
     Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
 
-    def at(times: Array) -> riccati.Coefficients:
+    def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)
-        return riccati.Coefficients(A, riccati.spread(B, R), np.broadcast_to(Q, A.shape))
+        return np.array((A, riccati.spread(B, R), np.broadcast_to(Q, A.shape)))
 
     residual = 0.0
     with riccati.bounded_by("smaller weights or a larger R"):

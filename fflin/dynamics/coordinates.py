@@ -153,13 +153,11 @@ class Chart:
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply parts of x (.., m, k), which have three rows each, by R in place."""
-        _turn(self.R, () if self.standing else parts, x)
+        """Multiply parts of x (.., m, k), which have three rows each, by R in place.
 
-    def turn_columns(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply parts of x (.., k, m), of three columns each, by R^T from the right in place."""
-        for columns in () if self.standing else parts:
-            x[..., columns] = product(x[..., columns], self.R.mT)
+        The transpose of a matrix is given to multiply parts of three columns by R^T from the right.
+        """
+        _turn(self.R, () if self.standing else parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts (three rows each) rotated by R to reference axes."""

@@ -142,17 +142,15 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
 
 def held_derivatives(
     A: Array, driven: Array, h: float, dA: Array, d_driven: Array
-) -> tuple[Array, ...]:
-    """Return the derivatives of `held_exponential` along (dA, d_driven)."""
+) -> tuple[Array, Array]:
+    """Return the derivatives of `held_exponential` along dA (.., n, n) and d_driven (.., n, k)."""
+    # The derivative of x obeys d(dx)/dt = A dx + dA x + d_driven u, a linear system in (dx, x).
     n = len(A)
-    if not dA.any() and not (A @ A).any():
-        return np.zeros_like(A), d_driven * h + A @ d_driven * (h * h / 2.0)
-    from scipy.linalg import expm_frechet
-
-    block, along = np.zeros((2, n + driven.shape[1], n + driven.shape[1]))
-    block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
-    derivative = expm_frechet(block, along, compute_expm=False)
-    return derivative[:n, :n], derivative[:n, n:]
+    both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
+    both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
+    forced = np.concatenate((d_driven, np.broadcast_to(driven, d_driven.shape)), axis=-2)
+    exponential, held = held_exponential(both, forced, h)
+    return exponential[..., :n, n:], held[..., :n, :]
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:

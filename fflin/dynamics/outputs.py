@@ -26,12 +26,11 @@ class Sensed(NamedTuple):
     y: Array
     by_q: Array  # over the tangent displacement of pin.integrate
     by_v: Array
-    by_a: Array | None  # None if no output depends on the acceleration a
+    by_a: Array  # over the acceleration a
 
     def part(self, rows: slice) -> Sensed:
         """Return views of the rows of one output."""
-        y, by_q, by_v, by_a = self
-        return Sensed(y[rows], by_q[rows], by_v[rows], None if by_a is None else by_a[rows])
+        return Sensed(*(each[rows] for each in self))
 
 
 class Point(NamedTuple):
@@ -53,6 +52,11 @@ class Point(NamedTuple):
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame on the robot."""
         return self.data.oMi[frame.joint] * frame.placement
+
+    def jacobian(self, frame: Carried) -> Array:
+        """Return the Jacobian (6, nv) of a frame in its own axes."""
+        of_frame = pin.getFrameVelocityDerivatives(self.model, self.data, *frame, _LOCAL)
+        return np.asarray(of_frame[1])
 
 
 # f(point, sensed, *frames) writes outputs and derivatives into `sensed`. Functions with frames
@@ -109,18 +113,25 @@ def _momentum(world: Measuring, _: object) -> Array:
     return np.concatenate((turned @ angular, turned @ linear))
 
 
-def _frame_pose_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
-    placement = at.placement(frame)
-    _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
-    to.y[:3] = at.r_b + at.R.dot(placement.translation)
-    to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[PIN_LINEAR])
-    to.by_q[3:] = jacobian[PIN_ANGULAR]
+def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) -> None:
+    # The pose of a frame relative to another frame, or to the reference if there is no other frame.
+    origin = at.placement(*other).inverse() if other else pin.SE3(at.R, at.r_b)
+    relative, jacobian = origin * at.placement(frame), at.jacobian(frame)
+    R, p = relative.rotation, relative.translation
+    to.y[:3] = p
+    to.by_q[:3], to.by_q[3:] = R.dot(jacobian[PIN_LINEAR]), jacobian[PIN_ANGULAR]
+    if other:
+        jacobian = at.jacobian(*other)
+        to.by_q[:3] += skew(p).dot(jacobian[PIN_ANGULAR]) - jacobian[PIN_LINEAR]
+        to.by_q[3:] -= R.T.dot(jacobian[PIN_ANGULAR])
+        to.by_q[:, :6] = 0.0  # a motion of the base moves both frames alike
 
 
-def _frame_pose(world: Measuring, before: Sequence[Array], frame: Carried) -> Array:
-    placement = world.placement(frame)
-    rotation = pin.log3(before[0].T @ placement.rotation)
-    return np.concatenate((world.reference.actInv(placement.translation), rotation))
+def _pose(world: Measuring, before: Sequence[Array], frame: Carried, *other: Carried) -> Array:
+    origin = world.placement(*other) if other else world.reference
+    relative = origin.actInv(world.placement(frame))
+    attitude = (before[1] if other else origin.rotation).T @ before[0]
+    return np.concatenate((relative.translation, pin.log3(attitude.T @ relative.rotation)))
 
 
 def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
@@ -140,28 +151,6 @@ def _frame_velocity(world: Measuring, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     R = world.reference.rotation.T @ world.placement(frame).rotation
     return np.concatenate((velocity.angular, R @ velocity.linear))
-
-
-def _relative_pose_derivatives(at: Point, to: Sensed, *frames: Carried) -> None:
-    placement, other = map(at.placement, frames)
-    jacobian, of_other = (
-        pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1] for frame in frames
-    )
-    relative = other.actInv(placement)
-    R, p = relative.rotation, relative.translation
-    to.y[:3] = p
-    to.by_q[:3] = (
-        R.dot(jacobian[PIN_LINEAR]) - of_other[PIN_LINEAR] + skew(p).dot(of_other[PIN_ANGULAR])
-    )
-    to.by_q[3:] = jacobian[PIN_ANGULAR] - R.T.dot(of_other[PIN_ANGULAR])
-    to.by_q[:, :6] = 0.0  # a motion of the base moves both frames alike
-
-
-def _relative_pose(world: Measuring, before: Sequence[Array], *frames: Carried) -> Array:
-    placement, other = map(world.placement, frames)
-    rotation = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ placement.rotation)
-    position = other.rotation.T @ (placement.translation - other.translation)
-    return np.concatenate((position, rotation))
 
 
 def _angular_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
@@ -189,7 +178,6 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
         at.model, at.data, *frame, _LOCAL
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
-    assert to.by_a is not None
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
     # Derivatives of omega_b x v_b and of -g, which is constant in world axes.
     of_base = by_a[:, PIN_LINEAR]
@@ -208,9 +196,9 @@ def _accelerometer(world: Measuring, _: object, frame: Carried) -> Array:
 KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
     kinds.CenterOfMass: (_center_of_mass_derivatives, _center_of_mass),
     kinds.Momentum: (_momentum_derivatives, _momentum),
-    kinds.FramePose: (_frame_pose_derivatives, _frame_pose),
+    kinds.FramePose: (_pose_derivatives, _pose),
     kinds.FrameVelocity: (_frame_velocity_derivatives, _frame_velocity),
-    kinds.RelativePose: (_relative_pose_derivatives, _relative_pose),
+    kinds.RelativePose: (_pose_derivatives, _pose),
     kinds.Gyroscope: (_gyroscope_derivatives, _gyroscope),
     kinds.Accelerometer: (_accelerometer_derivatives, _accelerometer),
 }
@@ -277,8 +265,7 @@ class Sensing:
         `data` is overwritten. The acceleration `a` is ignored unless `needs_acceleration`.
         """
         ny, nv = len(self.names), len(v)
-        by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
-        sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
+        sensed = Sensed(np.zeros(ny), *np.zeros((3, ny, nv)))
         if not self._kinds:
             return sensed
         state, robot = self.state, self.state.robot

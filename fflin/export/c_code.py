@@ -24,12 +24,12 @@ from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, read_file, write_atomically
-from fflin.control.policies import Loop, Policy
+from fflin.control.policies import Loop, Measure, Policy
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Actuation, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.export.laws import CASES, Law, law_of, measured
-from fflin.linear.fit import require_same, require_turns, sensed
+from fflin.linear.fit import require_same, require_turns
 from fflin.robot.robot import Robot
 
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
@@ -246,66 +246,50 @@ class CLaw:
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
         state = StateMap(robot, reference=self.origin, frame=frame_of(robot, self.frame))
-        actuation = Actuation(state)
-        there = {
-            "input": (actuation.names, actuation.units),
-            "state": (state.names, state.units),
-            "output": sensed(state),
-        }
         for kind, (names, units) in self._about["signals"].items():
-            require_same(made, robot, kind, (tuple(names), tuple(units)), there[kind])
+            require_same(made, state, kind, tuple(names), tuple(units))
         require_turns(made, self._about["nq"], robot)
         if self._about["kind"] == "output":
-            return _OutputLoop(self, state)
+            q, v = map(np.array, self._about["point"])
+            there, sizes = (Measuring(state, q), state.read(q, v)), (self._about["memory"], 0)
+            step = self._output_step
+            return Loop(state, self.dt, sizes, lambda t: (partial(step, t), *there))
         world, n = StateMap(robot, frame=state.frame), robot.n
         # C has no empty arrays, so an array for joints has at least one entry.
-        given, u = (
-            np.zeros(13 + 2 * max(n, 1), self._real),
-            np.zeros(len(actuation.names), self._real),
-        )
-        at = [*range(7 + n), *range(7 + max(n, 1), 13 + n + max(n, 1))]
+        room = max(n, 1)
+        given, u = (np.zeros(size, self._real) for size in (13 + 2 * room, len(self._about["u0"])))
+        at = [*range(7 + n), *range(7 + room, 13 + n + room)]
         samples = self._about["kind"] == "samples"
 
         def policy(t: float, q: Array, v: Array) -> Array:
             given[at] = measured(world, q, v)
             sample = (ctypes.c_ulong(round(t / self.dt)),) if samples else ()
-            self.call(t, *sample, given.ctypes, u.ctypes)
+            self._call(t, *sample, given.ctypes, u.ctypes)
             return u.astype(float)
 
         return policy
 
-    def call(self, t: float, *arguments: object) -> None:
+    def _output_step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
+        """Return the command of a sample, and the next state of the controller.
+
+        The code is called twice, because accelerometer outputs depend on the command. The first
+        call computes the command under which the second call's outputs are measured.
+        """
+        u = np.array(self._about["u0"])
+        for _ in range(2):
+            memory, out = np.append(z, 0.0).astype(self._real), np.zeros(len(u), self._real)
+            y = measure(u).astype(self._real)
+            self._call(t, memory.ctypes, y.ctypes, out.ctypes)
+            u = out.astype(float)
+        return u, memory[:-1].astype(float)
+
+    def _call(self, t: float, *arguments: object) -> None:
         """Call the C code at time t [s], or raise `InputError` if an argument is invalid."""
         if self._step(*arguments) == _INVALID:
             raise InputError(
                 f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
                 "finite or too large"
             )
-
-
-class _OutputLoop(Loop):
-    """Control loop that calls the C code as its controller."""
-
-    def __init__(self, law: CLaw, state: StateMap) -> None:
-        about = law._about
-        q, v = map(np.array, about["point"])
-        there = Measuring(state, q), state.read(q, v)
-        super().__init__(state, law.dt, None, about["memory"], lambda _: None, lambda _: there)
-        self._law, self._u0 = law, np.array(about["u0"])
-
-    def step(self, t: float, measure: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Return the command of a sample, and the next state of the controller.
-
-        The code is called twice, because accelerometer outputs depend on the command. The first
-        call computes the command under which the second call's outputs are measured.
-        """
-        real, u = self._law._real, self._u0
-        for _ in range(2):
-            memory, out = np.append(self.estimate, 0.0).astype(real), np.zeros(len(u), real)
-            y = measure(u).astype(real)
-            self._law.call(t, memory.ctypes, y.ctypes, out.ctypes)
-            u = out.astype(float)
-        return u, memory[:-1].astype(float)
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
@@ -357,7 +341,6 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     words: dict[str, object] = {
         **(_DOUBLE if real == "double" else _FLOAT),
         **{key: array(table) for key, table in tables.items()},
-        "continuous": array(np.array(law.continuous, dtype=bool)),
         **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
         **{"law": law.title, "frame": frame or "not known", "robot": _plain(robot.name)},
         "sha256": robot.urdf_sha256 or "not known",

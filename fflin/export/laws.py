@@ -19,7 +19,7 @@ from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.linear.fit import Signals, sensed
+from fflin.linear.fit import Signals, signals_of
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.loading import load
@@ -56,11 +56,10 @@ class Law:
     state: StateMap | None  # None for an output law
     signals: Signals  # names and units of the states or outputs
     inputs: Signals
-    continuous: list[bool]  # whether each joint or output is the angle of a continuous joint
     dt: float
     robot: Robot
     lin: LinearModel | None
-    tables: dict[str, Array]  # as in the C code, with u0, low and high for all laws
+    tables: dict[str, Array]  # as in the C code; u0, low, high and continuous for all laws
     operations: float  # bound on the number of rounded operations between an argument and a result
     cases: list[Case]
 
@@ -125,6 +124,7 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
     tables |= _limits(robot, limits, actuation.names)
     cases = list(_state_cases(state, bound(given, robot), dt, tables, axes))
     tables["in_reference_axes"] = np.array(state.axes)
+    tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
     if axes:
         sizes = [*map(len, axes.values())]
         tables["axis_joint"] = np.array([*map(robot.joint_names.index, axes)])
@@ -137,7 +137,6 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
         state=state,
         signals=(state.names, state.units),
         inputs=(actuation.names, actuation.units),
-        continuous=[joint.unbounded for joint in robot.joints],
         dt=dt,
         robot=robot,
         lin=lin,
@@ -243,14 +242,14 @@ def _output_law(
     given: LinearController | Compensator, lin: LinearModel | None, robot: Robot, limits: object
 ) -> Law:
     if isinstance(given, LinearController):
-        terms, lin = given.terms, given.lin
+        terms, lin = given.terms(), given.lin
         inputs = lin.input_names, lin.input_units
         signals = lin.output_names, lin.output_units
     else:
         none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
-        actuation, (names, units) = Actuation(state), sensed(state)
-        known = dict(zip(names + actuation.names, units + actuation.units, strict=True))
+        sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
+        known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
         inputs, signals = (
             (names, tuple(known.get(name, "unknown") for name in names))
             for names in (given.output_names, given.input_names)
@@ -261,18 +260,18 @@ def _output_law(
             "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
         )
     angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
-    continuous = [name in angles for name in signals[0]]
+    continuous = np.array([name in angles for name in signals[0]])
     tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")}
+    tables |= {"u0": terms.u0[None], "continuous": continuous}
     return Law(
         title=type(given).__name__,
         state=None,
         signals=signals,
         inputs=inputs,
-        continuous=continuous,
         dt=given.dt,
         robot=robot,
         lin=lin,
-        tables={**tables, "u0": terms.u0[None], **_limits(robot, limits, inputs[0])},
+        tables=tables | _limits(robot, limits, inputs[0]),
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
     )

@@ -16,7 +16,7 @@ import numpy as np
 from fflin.base.validation import Array
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
-from fflin.kernel.forward import MECHANICS, POINT, configure, push, seen, turn_held
+from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import called, load, root, store
 
@@ -27,15 +27,15 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
 
 class LeastSquares(
-    namedtuple("LeastSquares", "least most columns given A Q R b y wanted x s low high state order")
+    namedtuple("LeastSquares", "least most columns A Q R b y wanted x s low high state order")
 ):
     """Problem: find x (k,) with least <= x <= most for which columns @ x is nearest to a force.
 
     `columns` holds the k columns of generalised force per unit input, one after the other, and then
     the force. The other fields are work space:
 
-    - `given`: the columns and the force of one lane. `A`: the columns divided by the norm of the
-      matrix that they form.
+    - `A`: the columns of one lane, divided by the norm of the matrix that they form, and then the
+      force of this lane.
     - `Q`, `R`: QR factors of the free inputs' columns, extended by rows that contain `LEAST`.
       `order`: the free inputs, in the order in which they became free.
     - `b`: the residual. `y`: its components along `Q`.
@@ -130,8 +130,8 @@ def least_squares(least, most, size):
     """Return a problem with bounds (k,) and forces (size,), for a single lane."""
     count = len(least)
     lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
-    lengths |= {"A": count * size, "Q": count * (size + count), "R": count * count}
-    lengths |= dict.fromkeys(("columns", "given"), (count + 1) * size)
+    lengths |= dict.fromkeys(("columns", "A"), (count + 1) * size)
+    lengths |= {"Q": count * (size + count), "R": count * count}
     lengths |= {"b": size + count, "wanted": size}
     return empty(LEAST_SQUARES)._replace(
         least=least,
@@ -157,30 +157,16 @@ def allocate(allocation, point, commanded):
     vec.copy(point.q, 0, own.q, 0, len(own.q))
     configure(work, asking, own.q)
     factorise(work, tree)
-    vec.copy(commanded, 0, own.pushing, 0, len(commanded))
-    turn_held(asking, own)
-    push(work, tree, own.pushing)
-    vec.copy(work, tree.c, columns, count * size, size)
-    # Write the generalised force per unit of each input, one input after the other.
-    tree = giving.tree
-    carried = len(tree.wrench_body)
-    for entry in range(len(tree.driven) * size):
-        store(columns, entry, 0.0)
-    for index in range(len(tree.driven)):
-        if tree.driven[index] >= 0:
-            store(columns, index * size + tree.driven[index], 1.0)
-    for index in range(len(giving.held)):
-        at, axes = giving.held[index], vec.columns_of(seen(giving, own.q))
-        for axis in range(3):
-            turned = axes[0][axis], axes[1][axis], axes[2][axis]
-            vec.put3(columns, (at + axis) * size + tree.driven[at], turned)
     write_columns(work, tree)
-    for index in range(carried):
-        first = tree.input[index] * size
-        for row in range(size):
-            store(columns, first + row, load(work, tree.columns + row * carried + index))
+    vec.copy(commanded, 0, own.pushing, 0, len(commanded))
+    _write_force(work, asking, own, columns, count * size)
+    # Write the generalised force per unit of each input, one input after the other.
+    write_columns(work, giving.tree)
+    for unit in range(count):
+        for index in range(count):
+            store(own.pushing, index, 1.0 if index == unit else 0.0)
+        _write_force(work, giving, own, columns, unit * size)
     # Replace each force f by D^-1/2 L^-T f, whose squared norm is f^T M^-1 f.
-    tree = asking.tree
     for column in range(count + 1):
         solve_inwards(work, tree, columns, column * size)
         for k in range(size):
@@ -192,15 +178,22 @@ def allocate(allocation, point, commanded):
             vec.poke(point.u, index, lane, problem.x[index])
 
 
+def _write_force(work, robot, point, columns, at):
+    """Write the generalised force of the inputs `pushing` of a point."""
+    turn_held(robot, point)
+    push(work, robot.tree, point.pushing)
+    vec.copy(work, robot.tree.c, columns, at, len(robot.tree.row))
+
+
 @called
 def solve(problem, size, lane):
     """Write the solution of one lane into x; x is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
-    least, most, count, given = problem.least, problem.most, len(problem.least), problem.given
-    write_scaled(problem.columns, lane, 1.0, given)
+    least, most, count = problem.least, problem.most, len(problem.least)
+    write_scaled(problem.columns, lane, 1.0, A)
     last = count * size
-    unit = root(row_product(given, 0, given, 0, last))
-    force = root(row_product(given, last, given, last, size))
+    unit = root(row_product(A, 0, A, 0, last))
+    force = root(row_product(A, last, A, last, size))
     nothing = not (unit > 0.0 and force > 0.0)
     scale = 1.0 if nothing else unit / force
     free = 0
@@ -213,8 +206,8 @@ def solve(problem, size, lane):
             problem.order[free] = j
             free += 1
     if not nothing:
-        write_scaled(given, 0, 1.0 / unit, A)
-        write_scaled(given[last:], 0, 1.0 / force, wanted)
+        write_scaled(A[last:], 0, 1.0 / force, wanted)
+        write_scaled(A, 0, 1.0 / unit, A)
         free, kept = _solve_scaled(problem, size, free, 0)
         # Remove the part of the force that the inputs cannot produce, because its rounding error
         # would exceed the rows of LEAST.
@@ -315,7 +308,7 @@ def _fit(problem, size, free, kept):
 def _steepest(problem, size):
     """Return the untried input whose release reduces the error fastest; -1 if there is none."""
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
-    row_products(problem.A, size, b, slopes)
+    row_products(problem.A[: len(state) * size], size, b, slopes)
     for j in range(len(state)):
         if state[j] == _LOW or state[j] == _HIGH:
             slope = LEAST * b[size + j] + slopes[j]

@@ -19,8 +19,8 @@ from fflin.kernel.vectors import load, splat, store
 # that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 # Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
-# moment and force (FORCE), and the moment and force that the accelerations c of the subtree's own
-# joints cause (CARRIED). FORCE excludes the effect of c until `accelerate_bodies` adds it.
+# moment and force (FORCE), and the moment and force that the accelerations c cause (CARRIED). FORCE
+# excludes the effect of c until `accelerate_bodies` adds it.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
@@ -77,11 +77,11 @@ def outwards(work, tree, q):
 
 
 def inwards(work, tree):
-    """Write the packed M and the composite inertias, from the tips inwards."""
+    """Write the packed M, its diagonal and the composite inertias, from the tips inwards."""
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
     zero = splat(work, 0.0)
-    for index in range(tree.entries):
+    for index in range(len(tree.path)):
         store(work, packed + index, 0.0)
     for index in range(bodies * INERTIA):
         store(work, inertias + index, load(work, tree.own + index))
@@ -128,6 +128,7 @@ def inwards(work, tree):
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index])
         vec.add(work, at, tree.armature[index])
+        store(work, tree.diagonal + index, load(work, at))
 
 
 def factorise(work, tree):
@@ -370,14 +371,9 @@ def accelerate_bodies(work, tree):
         vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
-        inertia = tree.inertias + body * INERTIA
-        place = tree.places + body * PLACE
-        above = tree.motion + tree.parent[body] * MOTION
-        rate = load(work, tree.c + tree.coordinate[body])
-        own = spatial_inertia_times(work, inertia, vec.times6(joint_axis(work, tree, body), rate))
+        added = vec.get6(work, tree.motion + body * MOTION + ADDED)
+        own = spatial_inertia_times(work, tree.own + body * INERTIA, added)
         carried = vec.plus6(vec.get6(work, at + CARRIED), own)
-        shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
-        vec.add6(work, at + FORCE, vec.plus6(carried, shared))
-        if tree.parent[body] > 0:
-            to = tree.load + tree.parent[body] * LOAD + CARRIED
-            vec.add6(work, to, at_parent(work, place, carried))
+        vec.add6(work, at + FORCE, carried)
+        to = tree.load + tree.parent[body] * LOAD + CARRIED
+        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, carried))

@@ -7,9 +7,9 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +30,13 @@ _QUOTAS = (
 )
 
 ENGINES = ("python", "compiled")
+
+# Functions that Python calls in compiled code.
+_COMPILED = {
+    "advance": "the loop that simulates eight runs at a time",
+    "derive": "the batch kernel",
+    "take": "the run statistics",
+}
 
 # Version of Python, as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
@@ -69,46 +76,39 @@ def checked_engine(engine: object) -> str | None:
     return engine
 
 
-def kernel(module: str, name: str, what: str = "the batch kernel") -> Compiled:
+def kernel(module: str, name: str) -> Compiled:
     """Return a function of the kernel, whose machine code is stored on disk at its first call."""
     with _TURN:  # several threads may call this function at the same time
-        return _prepared(module, name, what)
+        return _prepared(module, name)
 
 
 @cache
-def _prepared(module: str, name: str, what: str) -> Compiled:
+def _prepared(module: str, name: str) -> Compiled:
     from fflin.kernel.machine_code import translated
 
     compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name))
-    folder = Path(str(compiled.stats.cache_path))
-    with _between_processes(folder / f"{module}.{name}.lock"):
+    compile, folder = compiled.compile, Path(str(compiled.stats.cache_path))
+    lock = folder / f"{module}.{name}.lock"
+    with _between_processes(lock):
         for entry in _stored(folder, module, name)[1]:
             entry.unlink(missing_ok=True)
-    if not isinstance(compiled.compile, partial):  # if wrapped twice, it would wait for itself
-        compiled.compile = partial(_compile_alone, compiled.compile, folder, module, name, what)
-    return compiled
 
-
-def _compile_alone(
-    compile: Callable[[object], object],
-    folder: Path,
-    module: str,
-    name: str,
-    what: str,
-    signature: object,
-) -> object:
-    """Compile for a signature; if another process has compiled it meanwhile, load its code."""
-    # The lock _COMPILING admits one thread, so no thread waits for a file lock of its own process.
-    with _COMPILING, _between_processes(folder / f"{module}.{name}.lock"):
-        if not _stored(folder, module, name)[0]:
+    def compile_alone(signature: object) -> object:
+        """Compile for a signature; if another process has compiled it meanwhile, load its code."""
+        # _COMPILING admits one thread, so no thread waits for a file lock of its own process.
+        with _COMPILING, _between_processes(lock):
+            if _stored(folder, module, name)[0]:
+                return compile(signature)
             _log.warning(
                 "fflin: compiling %s; this happens only once, because the code is stored in %s",
-                what,
+                _COMPILED[name],
                 folder,
             )
-            with _seconds_shown(what):
+            with _seconds_shown(_COMPILED[name]):
                 return compile(signature)
-        return compile(signature)
+
+    compiled.compile = compile_alone
+    return compiled
 
 
 @contextmanager

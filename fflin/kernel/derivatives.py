@@ -189,9 +189,6 @@ def derive(tree, points, out, lanes, work):
             bodies.load_carried(work, tree, lanes.u)
         bodies.write_columns(work, tree)
         bodies.inwards(work, tree)
-        for k in range(size):  # `factorise` overwrites the diagonal of the packed M
-            value = load(work, tree.packed + tree.row[k] + tree.depth[k])
-            store(work, tree.diagonal + k, value)
         bodies.factorise(work, tree)
         if moves:
             bodies.collect(work, tree)

@@ -109,7 +109,8 @@ def turn_held(robot, point):
 def push(work, tree, pushing):
     """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
 
-    Forces and torques on the base in `pushing` are in base axes.
+    Forces and torques on the base in `pushing` are in base axes. `bodies.write_columns` must have
+    written the columns of body-fixed inputs.
     """
     size, count = len(tree.row), len(tree.wrench_body)
     for index in range(size):
@@ -117,7 +118,6 @@ def push(work, tree, pushing):
     for index in range(len(tree.driven)):
         if tree.driven[index] >= 0:
             vec.add(work, tree.c + tree.driven[index], load(pushing, index))
-    bodies.write_columns(work, tree)
     for index in range(count):
         u = load(pushing, tree.input[index])
         for row in range(size):
@@ -132,6 +132,7 @@ def accelerate(work, robot, point, rates, to):
     """
     tree, nu = robot.tree, point.nu
     force, size = tree.c, len(tree.row)
+    bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
     vec.copy(work, force, point.wrench, 0, 6)
     bodies.move_bodies(work, tree, nu)

@@ -9,10 +9,9 @@ a call within compiled code passes one pointer. The words must not change during
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Mapping
+from functools import cache, lru_cache
 from typing import Generic, NamedTuple, TypeVar
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
@@ -46,8 +45,6 @@ WHOLE, REAL, FLAG = Kind(np.intp), Kind(np.float64), Kind(np.bool_)
 INDICES, REALS, FLAGS = Kind(np.intp, 1), Kind(np.float64, 1), Kind(np.bool_, 1)
 # Array of doubles with one column per lane.
 LANED = Kind(np.float64, 2)
-
-_NOTHING = work_space(0)
 
 T_co = TypeVar("T_co", bound=NamedTuple, covariant=True)
 T = TypeVar("T", bound=NamedTuple)
@@ -90,50 +87,40 @@ def empty(kind: Struct[T]) -> T:
     for of in kind.kinds.values():
         if isinstance(of, Struct):
             parts.append(empty(of))
-        elif of == LANED:
-            parts.append(_NOTHING)
         else:
             parts.append(np.zeros((0,) * of.axes, of.dtype) if of.axes else 0)
     return kind.made._make(parts)
 
 
-def laid_out(value: T, kind: Struct[T], fresh: Callable[[Array, Array], None] | None = None) -> T:
+def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tuple[Array, Array]]]:
     """Convert the fields of a named tuple to the kinds of its struct.
 
-    `fresh` is called with each new laned array and with the column of values that fills it.
+    Return the converted tuple, its words, and a pair for each laned array: the array, and the
+    column of values that fills it. The arrays of the tuple must outlive the words.
     """
-    if value is empty(kind):
-        return value
     parts: list[object] = []
-    for part, of in zip(value, kind.kinds.values(), strict=True):
-        if isinstance(of, Struct):
-            parts.append(laid_out(part, of, fresh))
-        elif of == LANED and len(part):
-            lanes, column = work_space(len(part)), np.array(part, dtype=float)[:, None]
-            lanes[:] = column
-            parts.append(lanes)
-            if fresh:
-                fresh(lanes, column)
-        elif of.axes:
-            parts.append(_NOTHING if of == LANED else np.require(part, of.dtype, ("C", "W")))
-        else:
-            parts.append(of.dtype(part).item())
-    return value._make(parts)
-
-
-def words_of(value: T, kind: Struct[T]) -> NDArray[np.int64]:
-    """Return the words of a named tuple from `laid_out`; its arrays must outlive the words."""
     words: list[int] = []
+    fresh: list[tuple[Array, Array]] = []
     for part, of in zip(value, kind.kinds.values(), strict=True):
         if isinstance(of, Struct):
-            words += words_of(part, of).tolist()
+            inner, of_inner, new = laid_out(part, of)
+            parts.append(inner)
+            words += of_inner.tolist()
+            fresh += new
         elif of.axes:
-            fits = part.dtype == of.dtype and part.ndim == of.axes
-            assert part.flags.c_contiguous and (fits or not part.size)
-            words += [part.__array_interface__["data"][0], *part.shape]
+            array = np.ascontiguousarray(part, of.dtype)
+            if of == LANED:
+                column, array = array.reshape(-1, 1).copy(), work_space(len(array))
+                array[:] = column
+                fresh.append((array, column))
+            assert array.ndim == of.axes
+            parts.append(array)
+            words += [array.__array_interface__["data"][0], *array.shape]
         else:
-            words.append(int(np.float64(part).view(np.int64)) if of == REAL else int(part))
-    return np.array(words, dtype=np.int64)
+            number = of.dtype(part).item()
+            parts.append(number)
+            words.append(int(np.float64(number).view(np.int64)) if of == REAL else int(number))
+    return value._make(parts), np.array(words, dtype=np.int64), fresh
 
 
 # PLACE is the number of entries of a body's pose: x axis, y axis, z axis, and origin relative to
@@ -150,7 +137,7 @@ class Tree(
         "Tree",
         "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
         "target share row depth path common driven wrench_body wrench input stored_body stored "
-        "stiffness damping entries places own inertias packed scaled diagonal square motion load "
+        "stiffness damping places own inertias packed scaled diagonal square motion load "
         "bias c columns lower held size",
     )
 ):
@@ -188,14 +175,14 @@ class Tree(
     - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta.
     - `stiffness`, `damping`: the springs and dampers of the joints.
 
-    `entries` is the number of entries of the packed M. The following fields are offsets of the
-    parts of the work space, and `size` is the size of the work space.
+    The other fields are offsets of the parts of the work space, and `size` is the size of the work
+    space.
     """
 
 
 _OF_TREE = {
     INDICES: "parent index coordinate target row depth path driven wrench_body input stored_body",
-    WHOLE: "entries places own inertias packed scaled diagonal square motion load bias c columns "
+    WHOLE: "places own inertias packed scaled diagonal square motion load bias c columns "
     "lower held size",
     LANED: "fixed bodies wrench stored stiffness damping",
 }
@@ -203,18 +190,9 @@ _AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
 TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
 
 
-# Each robot's tree is computed once, because robots do not change.
-_TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
-
-
+@lru_cache(maxsize=16)  # robots do not change
 def batch_tree(robot: Robot) -> Tree | None:
     """Return a robot's tree; None in orbit, or if a joint is not a screw about a constant axis."""
-    if robot not in _TREES:
-        _TREES[robot] = _tree(robot)
-    return _TREES[robot]
-
-
-def _tree(robot: Robot) -> Tree | None:
     if robot.orbit:
         return None
     model = robot.model
@@ -232,13 +210,11 @@ def _tree(robot: Robot) -> Tree | None:
         # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
         dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
         inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
-    # The coordinate that moves each body's joint, and the joint's motion per unit of it.
-    moved = {joint.idx_v: (6 + index, joint.scale) for index, joint in enumerate(robot.joints)}
-    for follower, leader, multiplier, _ in robot.followers:
-        moved[follower.idx_v] = (moved[leader.idx_v][0], multiplier)
-    of_bodies = [(5, 1.0), *(moved[joint.idx_v] for joint in joints[1:])]
-    coordinate, factor = map(list, zip(*of_bodies, strict=True))
     state, size = StateMap(robot), 6 + robot.n
+    # A row of S, with v = S nu, has one nonzero entry: a joint's motion per unit of its coordinate.
+    S, of_v = state.spread(np.eye(size)).T, [joint.idx_v for joint in joints]
+    coordinate = np.abs(S).argmax(axis=1)[of_v].tolist()
+    factor = S[of_v, coordinate].tolist()
     paths = _paths(size, parent, coordinate)
     row = np.cumsum([0, *map(len, paths[:-1])])
     target, share = [], []
@@ -263,7 +239,7 @@ def _tree(robot: Robot) -> Tree | None:
         wrench_body += [joint - ROOT] * len(numbers)
         inputs += numbers.tolist()
         wrenches += [np.r_[turned @ w[PIN_ANGULAR], turned @ w[PIN_LINEAR]] for w in columns.T]
-    entries, count = int(sum(map(len, paths))), len(inputs)
+    entries, count = sum(map(len, paths)), len(inputs)
     sizes = [bodies * PLACE, bodies * INERTIA, bodies * INERTIA, entries, entries, size]
     sizes += [size * size, bodies * MOTION, bodies * LOAD, size, size, size * count]
     sizes += [size * 2 * size, size * 6]
@@ -278,7 +254,7 @@ def _tree(robot: Robot) -> Tree | None:
         axes,
         np.array(coordinate),
         np.array(factor),
-        state.spread(np.eye(size)) ** 2 @ model.armature,
+        S.T**2 @ model.armature,
         np.array(target, dtype=np.intp),
         np.array(share, dtype=float),
         row,
@@ -293,7 +269,6 @@ def _tree(robot: Robot) -> Tree | None:
         np.array([axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]).ravel(),
         np.array(robot.springs.stiffness),
         np.array(robot.springs.damping),
-        entries,
         *np.cumsum([0, *sizes]).tolist(),
     )
 

@@ -193,7 +193,7 @@ def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
 def _checked(robot: Robot, lin: LinearModel) -> Check:
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     require_fit(lin, robot, state, whole=True)
-    require_sensed(lin, robot, state)
+    require_sensed(lin, state)
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
     aba, M = Aba(state), inertia_matrix(robot, lin)
     A, B, aba_inverse = aba_route(aba, q, v, lin.u0, moving=lin.moving)

@@ -18,8 +18,10 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin import Gain, GainBatch
 
+Names: TypeAlias = tuple[str, ...]
+
 # Names of signals, and their units in the same order.
-Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
+Signals: TypeAlias = tuple[Names, Names]
 
 
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
@@ -27,41 +29,46 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool 
 
     A reduced model, which lacks states of the robot, is accepted unless `whole` is True.
     """
-    made, actuation = f"the model was made for '{lin.robot}'", Actuation(state)
-    own, there = (lin.state_names, lin.state_units), (state.names, state.units)
-    if not whole:
-        units = dict(zip(*there, strict=True))
-        names = tuple(name for name in lin.state_names if name in units)
-        there = names, tuple(units[name] for name in names)
-    require_same(made, robot, "state", own, there)
-    own, there = (lin.input_names, lin.input_units), (actuation.names, actuation.units)
-    require_same(made, robot, "input", own, there)
+    made = f"the model was made for '{lin.robot}'"
+    require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)
+    require_same(made, state, "input", lin.input_names, lin.input_units)
     require_turns(made, len(lin.q), robot)
 
 
-def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+def require_sensed(lin: LinearModel, state: StateMap) -> None:
     """Raise `InputError` if a model's outputs differ from the robot's."""
-    own = lin.output_names, lin.output_units
-    require_same(f"the model was made for '{lin.robot}'", robot, "output", own, sensed(state))
+    made = f"the model was made for '{lin.robot}'"
+    require_same(made, state, "output", lin.output_names, lin.output_units)
 
 
-def sensed(state: StateMap) -> Signals:
-    """Return the names and units of a robot's outputs."""
-    outputs = state.robot.outputs
-    found = state if outputs == (FullState(),) else Sensing(state, outputs)
+def signals_of(state: StateMap, kind: str) -> Signals:
+    """Return the names and units of a robot's signals; `kind` is state, input or output."""
+    found: StateMap | Actuation | Sensing = state
+    if kind == "input":
+        found = Actuation(state)
+    elif kind == "output" and state.robot.outputs != (FullState(),):
+        found = Sensing(state, state.robot.outputs)
     return found.names, found.units
 
 
-def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
-    """Raise `InputError` if names or units differ from the robot's; the message lists them."""
-    if own == there:
+def require_same(
+    made: str, state: StateMap, kind: str, names: Names, units: Names | None, *, part: bool = False
+) -> None:
+    """Raise `InputError` if names or units differ from the robot's; the message lists them.
+
+    Units are not compared if they are None. With `part`, the robot may have more signals.
+    """
+    robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
+    if part:
+        others = {name: others[name] for name in names if name in others}
+    if names == tuple(others) and units in (None, tuple(others.values())):
         return
-    mine, others = dict(zip(*own, strict=True)), dict(zip(*there, strict=True))
-    names = [n for n in mine if n not in others] or [n for n in others if n not in mine]
+    mine = dict(zip(names, units or map(others.get, names), strict=True))
+    lacking = [n for n in mine if n not in others] or [n for n in others if n not in mine]
     changed = [name for name in mine if mine[name] != others.get(name)]
-    if names:
-        said = "lacks" if names[0] in mine else "also has"
-        said += f" the {kind}{'s' * bool(names[1:])} {listed(names)}"
+    if lacking:
+        said = "lacks" if lacking[0] in mine else "also has"
+        said += f" the {kind}{'s' * bool(lacking[1:])} {listed(lacking)}"
     elif changed:
         said = f"has its {kind} {changed[0]} in {others[changed[0]]}, not {mine[changed[0]]}"
     else:
@@ -133,7 +140,7 @@ def outputs(
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     require_fit(lin, robot, state)
-    require_sensed(lin, robot, state)
+    require_sensed(lin, state)
     at = robot.checked_configuration(q)
     moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")

@@ -77,8 +77,8 @@ class LinearTrajectory(Trajectory):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        made, there = "the linear trajectory was made for another robot", self._aba.state.names
-        require_same(made, self.robot, "state", (self.state_names,) * 2, (there,) * 2)
+        made = "the linear trajectory was made for another robot"
+        require_same(made, self._aba.state, "state", self.state_names, None)
 
     @property
     def input_units(self) -> tuple[str, ...]:

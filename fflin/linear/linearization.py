@@ -271,9 +271,9 @@ class Linearizer:
             self._fields["_reference"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether only B must be computed for a model at rest. This requires default inputs, outputs
+        # Whether only B must be computed for a model at rest. This requires the default outputs
         # and reference, and no springs, gravity, orbit or stored momentum.
-        self._known = ready.free and ready.own_reference and ready.actuation.default
+        self._known = ready.free and ready.own_reference
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -288,13 +288,18 @@ class Linearizer:
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
-                self._accelerations.invert(q, B[self._lower])
+                self._accelerations.write_by_u(q, B[self._lower])
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
             # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
+
+    def write_by_u(self, q: Array, out: Array) -> None:
+        """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
+        with self._lock:
+            self._accelerations.write_by_u(q, out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy cannot share the work space, so the constructor builds it again.

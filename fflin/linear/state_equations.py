@@ -63,9 +63,9 @@ def assemble(
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         # Rotate no columns of the base's linear velocity, because they are zero.
-        chart.turn_columns((ANGULAR,) if omega_in_reference else (), rates.by_nu)
+        chart.turn_rows((ANGULAR,) if omega_in_reference else (), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
-        chart.turn_columns(actuation.held, rates.by_u)
+        chart.turn_rows(actuation.held, rates.by_u.mT)
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.6)
@@ -142,7 +142,7 @@ def output_equations(
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
     turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
     D: Array = np.zeros((len(by_q), len(u)))
-    if sensed.by_a is not None:
+    if sensing.needs_acceleration:
         by_rate = state.columns(sensed.by_a)
         rate_by_nu = rates.by_nu.copy()
         rate_by_nu[LINEAR, ANGULAR] += skew(nu[LINEAR])  # (4.5)
@@ -153,7 +153,7 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        chart.turn_columns(actuation.held, by_u)
+        chart.turn_rows(actuation.held, by_u.mT)
         D[:] = by_u  # (8.3)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,16 +12,7 @@ import numpy as np
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.validation import Array, dimension, number, numbers
-from fflin.robot import inputs as kinds
-from fflin.robot.inputs import (
-    Input,
-    JointTorque,
-    ReactionWheel,
-    Thruster,
-    named_inputs,
-    named_wheels,
-    three_numbers,
-)
+from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs, three_numbers
 from fflin.robot.joints import by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
@@ -39,60 +29,30 @@ Range: TypeAlias = tuple[float, float]
 RULES = ("urdf", "identity")
 
 
-def checked_inputs(value: object, bare: Robot, passive: Sequence[str]) -> tuple[Input, ...]:
-    """Check inputs; replace a torque on a pattern of joints by one torque for each joint.
-
-    `bare` is the robot without wheels and modes.
-    """
-    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
-        raise InputError(f"inputs is {value!r}, expected a sequence of at least one input")
-    inputs: list[Input] = []
-    for item in value:
-        if not isinstance(item, Input):
-            known = ", ".join(kind.__name__ for kind in kinds.KINDS)
-            raise InputError(f"{item!r} is not an input; expected {known}")
-        if not isinstance(item, JointTorque):
-            inputs.append(item)
-            continue
-        found = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
-        if item.joint in found and item.joint in passive:
-            raise InputError(
-                f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
-                "from passive, or the torque from the inputs"
-            )
-        inputs += [replace(item, joint=name) for name in found if name not in passive]
-    if not inputs:
-        raise InputError("all inputs are torques of passive joints; add an input that is not")
-    names = [name for _, own in named_inputs(inputs) for name in own]
-    for each in names:
-        if names.count(each) > 1:
-            raise InputError(f"input '{each}' is given twice; remove one of them")
-    return tuple(inputs)
-
-
-def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
+def _input_keys(robot: Robot) -> tuple[str, ...]:
     """Return input names with groups, such as "thrust.NAME"; see `fflin.base.names.input_keys`."""
-    pairs = ((item.GROUP, name) for item, names in named_inputs(inputs) for name in names)
+    pairs = ((item.GROUP, name) for item, names in named_inputs(robot.inputs) for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
-def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: object) -> dict[str, Range]:
+def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     """Return limits as {input or state: (least, largest)}.
 
     The limits are given by name, or as one limit for all inputs.
     """
-    keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
+    named = named_inputs(robot.inputs)
+    keys, states = _input_keys(robot), state_keys(robot.joint_names)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
     floors += [-math.inf] * len(states)
     if not isinstance(given, Mapping):
-        given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
+        given = dict.fromkeys((item.GROUP for item in robot.inputs), given)
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
     # A limit for all joints does not apply to wheels, because wheels are much faster.
     groups: Sequence[str] = ("q_m", "qdot_m")
-    wheels = {f"{group}.{name}" for group in groups for name, _ in named_wheels(inputs)}
+    wheels = {f"{x}.{own[0]}" for item, own in named if item.GROUP == "wheel" for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
     found = by_name("input or state", whole, (*keys, *states))
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
@@ -169,7 +129,7 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
 
 def _weights(value: object, robot: Robot) -> dict[str, object]:
     """Check the weights of a robot's regulator, whose keys name states and inputs."""
-    states, inputs = state_keys(robot.joint_names), _input_keys(robot.inputs)
+    states, inputs = state_keys(robot.joint_names), _input_keys(robot)
     kinds = {"q": states, "r": inputs, "bryson": (*states, *inputs)}
     given = _parts("weights", value, ("rule", *kinds))
     weights: dict[str, object] = {}
@@ -215,7 +175,7 @@ FIELDS: dict[str, Callable[[object, Robot], Any]] = {
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),
     "orbit": lambda value, _: checked_orbit(value),
-    "limits": lambda value, robot: given_limits(robot.inputs, robot.joint_names, value),
+    "limits": _given_limits,
     "weights": _weights,
     **{name: partial(_state, name) for name in ("point", "target", "start")},
 }
@@ -292,7 +252,7 @@ def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[
                 )
             cutting = own
         elif part is not None:
-            given |= given_limits(robot.inputs, robot.joint_names, part)
+            given |= _given_limits(part, robot)
     return cutting | given, own | given
 
 

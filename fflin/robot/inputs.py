@@ -3,13 +3,17 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, TypeAlias, cast
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, TypeAlias, cast
 
 import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, dimension, number, positive, truth
+from fflin.robot.joints import by_joint
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -286,6 +290,40 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
     if length == 0.0:
         raise InputError(f"{what} is zero; give a direction")
     return x / length, y / length, z / length
+
+
+def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tuple[Input, ...]:
+    """Check inputs; replace a torque on a pattern of joints by one torque for each joint.
+
+    `bare` is the robot without wheels and modes.
+    """
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(f"inputs is {value!r}, expected a sequence of inputs")
+    inputs: list[Input] = []
+    for item in value:
+        if not isinstance(item, Input):
+            known = ", ".join(kind.__name__ for kind in KINDS)
+            raise InputError(f"{item!r} is not an input; expected {known}")
+        if not isinstance(item, JointTorque):
+            inputs.append(item)
+            continue
+        found = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
+        if item.joint in found and item.joint in passive:
+            raise InputError(
+                f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+                "from passive, or the torque from the inputs"
+            )
+        inputs += [replace(item, joint=name) for name in found if name not in passive]
+    if not inputs:
+        raise InputError(
+            f"inputs is {value!r}, expected at least one input that is not the torque of a passive "
+            "joint"
+        )
+    names = [name for _, own in named_inputs(inputs) for name in own]
+    for each in names:
+        if names.count(each) > 1:
+            raise InputError(f"input '{each}' is given twice; remove one of them")
+    return tuple(inputs)
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:

@@ -13,13 +13,11 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, ArrayLike, vector
+from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
-_CONFIGURATION = "a configuration in Pinocchio's order"
-
-# Largest rounding error of the squared length of a normalised quaternion: two ulp of 1.
+# Largest rounding error of the length of a normalised quaternion: two ulp of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # pin.Data takes about 32 nv^3 bytes, because it contains third-order tensors of nv^3 entries.
@@ -198,25 +196,17 @@ class Coordinates:
 
     def checked_configuration(self, q: ArrayLike) -> Array:
         """Return q (nq,) with errors of up to 1e-6 corrected, or raise `InputError`."""
-        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
-            q = self._sized("q", q, self.nq, _CONFIGURATION)
-        entries = q.tolist()
-        if not math.isfinite(sum(entries)):
-            vector("q", q, self.nq, _CONFIGURATION)  # raises an error that names the entry
-        x, y, z, w = entries[3:7]
-        square = x * x + y * y + z * z + w * w
-        worst = abs(square - 1.0)
-        if worst > NORM_TOLERANCE:
-            raise _not_of_length_1("the base quaternion (x, y, z, w) q[3:7]", square)
-        for index in self.unbounded:
-            square = entries[index] ** 2 + entries[index + 1] ** 2
-            error = abs(square - 1.0)
-            if error > worst:
-                worst = error
-                if error > NORM_TOLERANCE:
-                    what = f"(cos, sin) of continuous joint '{self.unbounded[index]}'"
-                    raise _not_of_length_1(f"{what}, q[{index}:{index + 2}],", square)
-        near: Array = pin.normalize(self.model, q) if worst > ROUND_OFF else q
+        near = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
+        if not pin.isNormalized(self.model, near, ROUND_OFF):
+            parts = {(3, 7): "the base quaternion (x, y, z, w) q[3:7]"}
+            for at, name in self.unbounded.items():
+                parts[at, at + 2] = f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
+            for (first, last), what in parts.items():
+                square = sum(entry * entry for entry in near[first:last].tolist())
+                if abs(square - 1.0) > NORM_TOLERANCE:
+                    length = math.sqrt(square)
+                    raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
+            near = pin.normalize(self.model, near)
         return self._followed(near) if self.followers else near
 
     def checked_velocity(self, v: ArrayLike) -> Array:
@@ -305,11 +295,6 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
                 return f"the {what} of joint '{made.names[at]}'"
             return f"the frame '{made.frames[at].name}'" if what == "frames" else f"its {what}"
     return ""
-
-
-def _not_of_length_1(what: str, square: float) -> InputError:
-    length = math.sqrt(square)
-    return InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import TypeVar
@@ -14,10 +15,10 @@ from typing import TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError, UnknownNameError, unknown
+from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
 from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import instance, is_rotation
-from fflin.base.writing import remember
+from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS
@@ -26,7 +27,7 @@ from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import LinkMass, given_body, massless_note
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic, is_impossible
-from fflin.robot.urdf.reader import ignored, read_urdf
+from fflin.robot.urdf.reader import SIZE_LIMIT, describe, ignored
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
@@ -111,7 +112,7 @@ def load(
     if found.path.suffix.lower() == ".toml":
         document, found, own, of_file = _read_robot_file(found)
         later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
-    urdf = read_urdf(found.path)
+    urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path)
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
@@ -348,9 +349,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 def _document(path: Path) -> TomlFile:
     """Read a robot file or a file of inputs; raise `UnknownNameError` for an unknown key."""
     document = TomlFile(path)
-    for key in document.record:
-        if key not in KEYS:
-            raise document.error(unknown("key of a robot file", key, KEYS), key)
+    with document.located():
+        require_known("key of a robot file", document.record, KEYS)
     return document
 
 
@@ -382,7 +382,9 @@ def _read_robot_file(
         lock = requested(values.get("lock", ()))
     if "input" in record:
         values["inputs"] = _read_inputs(document)
-    if appendages := _read_appendages(document):
+    of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
+    appendages = _built(document, "flexible", partial(_maker, FlexibleAppendage, of_nastran))
+    if appendages := appendages + _built(document, "slosh", partial(_maker, Slosh, of_tank)):
         values["appendages"] = appendages
     # The robot has the name of the TOML file, not of the URDF.
     found = found._replace(name=file.name, package_dirs=dirs)
@@ -391,63 +393,54 @@ def _read_robot_file(
 
 def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file; see `load_inputs`."""
-    inputs: list[Input] = []
-    for index, table in enumerate(_tables(document, "input")):
-        values = {**table}
-        kind = str(values.pop("type", ""))
-        if "type" not in table:
-            problem = f"input {index + 1}: the key 'type' is missing; set 'type' to one of "
-            raise document.error(problem + ", ".join(_TYPES), "input", index)
-        if kind not in _TYPES:
-            problem = f"input {index + 1}: no valid 'type': {unknown('type', kind, _TYPES)}"
-            raise document.error(UnknownNameError(problem), "input", index, "type")
-        inputs.append(_built(document, ("input", index), _TYPES[kind], values))
+    inputs = tuple(_built(document, "input", _input_type))
     if not inputs:
         message = "the file contains no inputs; add a table [[input]] with its type"
         raise InputError(f"{document.path}: {message}")
-    return tuple(inputs)
+    return inputs
 
 
-def _read_appendages(document: TomlFile) -> list[Appendage]:
-    found: list[Appendage] = []
-    for key, make, special in (
-        ("flexible", FlexibleAppendage, FlexibleAppendage.from_nastran),
-        ("slosh", Slosh, Slosh.cylinder),
-    ):
-        # `alone` contains the keys that are valid only for a Nastran file or a cylindrical tank.
-        alone = set(signature(special).parameters) - set(signature(make).parameters)
-        for index, table in enumerate(_tables(document, key)):
-            values = {**table}
-            for name in {"op4", "asm"} & set(values):
-                values[name] = document.path.parent / str(values[name])
-            build: Callable[..., Appendage] = special if alone & set(values) else make
-            found.append(_built(document, (key, index), build, values))
-    return found
+def _input_type(values: dict[str, object]) -> type[Input]:
+    """Remove the type from the values of an input, and return the class that it names."""
+    if "type" not in values:
+        raise InputError(f"the key 'type' is missing; set 'type' to one of {', '.join(_TYPES)}")
+    kind = str(values.pop("type"))
+    require_known("valid 'type'", [kind], _TYPES)
+    return _TYPES[kind]
 
 
-def _tables(document: TomlFile, key: str) -> list[dict[str, object]]:
-    """Return an array of tables from a file, or an empty list if the file has no such array."""
-    tables = document.record.get(key, [])
-    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
-        raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
-    return tables
+def _maker(
+    make: Callable[..., Appendage], special: Callable[..., Appendage], values: Mapping[str, object]
+) -> Callable[..., Appendage]:
+    """Return `special` if a key is valid only for a Nastran file or a cylindrical tank."""
+    alone = set(signature(special).parameters) - set(signature(make).parameters)
+    return special if alone & set(values) else make
 
 
 def _built(
-    document: TomlFile, table: tuple[str, int], build: Callable[..., T], values: dict[str, object]
-) -> T:
-    """Build an object from a table; errors begin with file and line."""
-    of, parameters = f"{table[0]} {table[1] + 1}: ", dict(signature(build).parameters)
-    if isinstance(name := values.get("name"), str):
-        of = of.replace(":", f" ('{name}'):")
-    if build is FlexibleAppendage:  # these parameters come only from Nastran files
-        del parameters["inertia"], parameters["rigid"]
-    for name in values:
-        if name not in parameters:
-            problem = f"{of}{unknown(f'key of {table[0]}', name, parameters)}"
-            raise document.error(UnknownNameError(problem), *table, name)
-    for name, parameter in parameters.items():
-        if parameter.default is parameter.empty and name not in values:
-            raise document.error(f"{of}the key '{name}' is missing; add this key", *table)
-    with document.located(*table, of=of):
-        return build(**values)
+    document: TomlFile, key: str, choose: Callable[[dict[str, object]], Callable[..., T]]
+) -> list[T]:
+    """Build an object from each table of an array; errors begin with file and line.
+
+    `choose` returns the class or function that builds the object from given values.
+    """
+    tables = document.record.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):
+        raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
+    built = []
+    for index, table in enumerate(tables):
+        values, name = {**table}, table.get("name")
+        of = f"{key} {index + 1}" + (f" ('{name}')" if isinstance(name, str) else "")
+        with document.located(key, index, of=f"{of}: "):
+            build = choose(values)
+            parameters = dict(signature(build).parameters)
+            if build is FlexibleAppendage:  # these parameters come only from Nastran files
+                del parameters["inertia"], parameters["rigid"]
+            require_known(f"key of {key}", values, parameters)
+            for each, parameter in parameters.items():
+                if parameter.default is parameter.empty and each not in values:
+                    raise InputError(f"the key '{each}' is missing; add this key")
+            for file in {"op4", "asm"} & set(values):
+                values[file] = document.path.parent / str(values[file])
+            built.append(build(**values))
+    return built

@@ -104,20 +104,20 @@ def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
 
 def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pin.Inertia]:
     """Return {joint index: inertia} with random changes of all bodies; see `Robot.perturbed`."""
-    checked = {key: number(key, value) for key, value in spreads.items()}
-    for key, spread in checked.items():
+    spreads = {key: number(key, value) for key, value in spreads.items()}
+    for key, spread in spreads.items():
         if not 0.0 <= spread < 1.0:
             raise InputError(f"{key} is {spread:g}, expected 0 or more and less than 1")
     draw, new = np.random.default_rng(whole("seed", seed, 0)), dict[int, pin.Inertia]()
     for index in range(ROOT, model.njoints):
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
-        if any(checked.values()):
+        if any(spreads.values()):
             body = model.inertias[index]
             # Root mean square distance [m] of the body's mass from its centre, along each axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
-            density, com = checked["mass"] * drawn[:, 0], checked["com"] * drawn[:, 1:4] * radii
-            wider = checked["inertia"] * drawn[:, 4:]
+            density, com = spreads["mass"] * drawn[:, 0], spreads["com"] * drawn[:, 1:4] * radii
+            wider = spreads["inertia"] * drawn[:, 4:]
             mass, com, about = properties(_stretched(body, np.eye(3), density, com, wider))
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
@@ -332,13 +332,11 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
 
 def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
     """Return whether the body of a joint is symmetric about the joint axis."""
-    if joint.prismatic:
-        return False
     pin_joint = robot.model.joints[index]
     data = pin_joint.createData()
     pin_joint.calc(data, robot.neutral())
     linear, axis = np.split(np.asarray(data.S).ravel(), 2)
-    if linear.any():  # a screw joint, which also translates
+    if linear.any():  # a joint that translates
         return False
     body, turn = robot.model.inertias[index], skew(axis)
     inertia = body.inertia

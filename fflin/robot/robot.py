@@ -14,20 +14,12 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known, unknown
 from fflin.base.validation import Array
+from fflin.robot import mass_properties
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
 from fflin.robot.fields import FIELDS, Range, checked_passive
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
-from fflin.robot.mass_properties import (
-    LinkMass,
-    Piece,
-    dynamic_parameters,
-    given_bodies,
-    idle_coordinates,
-    pieces_of,
-    random_bodies,
-)
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
 
@@ -140,7 +132,7 @@ class Robot(Coordinates):
     target: Mapping[str, Any] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
-    links: Mapping[str, LinkMass] = field(default_factory=dict)
+    links: Mapping[str, mass_properties.LinkMass] = field(default_factory=dict)
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
     appendages: tuple[Appendage, ...] = ()
@@ -241,11 +233,9 @@ class Robot(Coordinates):
         require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            passive = checked_passive(fields["passive"], self._bare)
-            inputs = [x for x in self.inputs if getattr(x, "joint", None) not in passive]
-            if not inputs:
-                raise InputError("all inputs are torques of passive joints; add another input")
-            robot = replace(self, passive=passive, inputs=tuple(inputs))
+            robot = replace(self, passive=checked_passive(fields["passive"], self._bare))
+            driven = [x for x in self.inputs if getattr(x, "joint", None) not in robot.passive]
+            fields = {"inputs": driven, **fields}
         if "inputs" in fields:
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
@@ -301,7 +291,7 @@ class Robot(Coordinates):
         UnknownNameError
             If a body or property does not exist.
         """
-        return self.with_bodies(given_bodies(self._bare.model, bodies))
+        return self.with_bodies(mass_properties.given_bodies(self._bare.model, bodies))
 
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
@@ -330,7 +320,7 @@ class Robot(Coordinates):
             Copy of the robot with the changed mass properties.
         """
         spreads = {"mass": mass, "com": com, "inertia": inertia}
-        return self.with_bodies(random_bodies(self._bare.model, seed, **spreads))
+        return self.with_bodies(mass_properties.random_bodies(self._bare.model, seed, **spreads))
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
         """Return a copy of the robot with other inertias {joint index: body}, including wheels."""
@@ -339,8 +329,8 @@ class Robot(Coordinates):
         model = bare.model.copy()
         for joint, body in bodies.items():
             model.inertias[joint] = body
-        digest, masses = self.urdf_sha256, dynamic_parameters(model)
-        if masses != dynamic_parameters(bare.model):
+        digest, masses = self.urdf_sha256, mass_properties.dynamic_parameters(model)
+        if masses != mass_properties.dynamic_parameters(bare.model):
             digest = sha256(digest.encode() + masses).hexdigest()
         other = replace(bare, model=model, urdf_sha256=digest)
         if bare is self:
@@ -359,7 +349,7 @@ class Robot(Coordinates):
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
     @property
-    def pieces(self) -> dict[str, Piece]:
+    def pieces(self) -> dict[str, mass_properties.Piece]:
         """Mass properties {name: piece} of all links, and of all bodies with several links."""
         return self._links_and_bodies[0]
 
@@ -368,7 +358,7 @@ class Robot(Coordinates):
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
         return self._links_and_bodies[1]
 
-    _links_and_bodies = cached_property(pieces_of)
+    _links_and_bodies = cached_property(mass_properties.pieces_of)
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -376,7 +366,7 @@ class Robot(Coordinates):
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
-    idle_coordinates = cached_property(idle_coordinates)
+    idle_coordinates = cached_property(mass_properties.idle_coordinates)
 
     @cached_property
     def wheels(self) -> dict[str, float]:

@@ -21,7 +21,7 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOut
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
-from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, words_of, work_space
+from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan, Times
@@ -139,12 +139,10 @@ class LaneLoop:
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
-        # Pairs of an array with one column per lane, and the column of its initial values.
-        self._fresh: list[tuple[Array, Array]] = []
-        self.parts = laid_out(parts, loop.ARGUMENTS, lambda *pair: self._fresh.append(pair))
-        self._words = words_of(self.parts, loop.ARGUMENTS)
+        # `_fresh` has pairs of an array with one column per lane and the column of initial values.
+        self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.tree.size)
-        self._advance = kernel("loop", "advance", "the loop that simulates eight runs at a time")
+        self._advance = kernel("loop", "advance")
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width, self.done = int(self.ends[-1]), 0
@@ -415,10 +413,10 @@ def _filtered(
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
-    samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
-    _, charts, near = zip(*samples, strict=True)
-    nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by, *_ in samples]
+    starts = [k * times.sample * times.dt for k in range(rows)]
+    _, measures, near = zip(*map(loop.at, starts), strict=True)
+    nz, stages = len(loop.estimate), 1 if times.sample else 1 + len(plan.method.nodes)
+    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(policy.terms, starts)]
     compensator = {
         key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
     }
@@ -428,7 +426,7 @@ def _filtered(
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for chart in charts]),
+        origin=np.concatenate([pin.SE3ToXYZQUAT(each.state.origin) for each in measures]),
         near=np.concatenate([x[state.groups.q_m] for x in near]),
         filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=measured,
@@ -442,9 +440,8 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     """Return the allocation from the commands of `asking` to the inputs of `giving`."""
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
-    point = empty(forward.POINT)._replace(
-        q=np.zeros(plant.robot.nq), pushing=np.zeros(len(asking.actuation.names))
-    )
+    inputs = max(len(robot.actuation.names) for robot in (asking, plant))
+    point = empty(forward.POINT)._replace(q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs))
     return allocation.Allocation(
         asking=asks,
         giving=giving,

@@ -17,7 +17,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, ArrayLike, instance, number, truth, vector, whole
-from fflin.control.channel import Channel, Law, Saturation, saturation, warn_beyond
+from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
 from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
@@ -179,7 +179,7 @@ class Plan:
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
-        self.wheels = [robot.joint(name).idx_v for name in self.limits.wheel_names]
+        self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         self.steered = fed_back(policy)  # states that are known to be fed back
         # Function noise(t) of the policy, which returns measurement noise, or None.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
@@ -193,10 +193,10 @@ class Plan:
             setattr(other, name, value)
         return other
 
-    def channel(self, law: Callable[..., Array], speeds: Callable[..., Array]) -> Channel:
-        """Return the channel from a law's commands to the inputs; its delay line is empty."""
+    def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
+        """Return the inputs under a law as a function of the step and the arguments of the law."""
         times = self.times
-        return Channel(law, self.initial, self.limits, times.sample, times.delay, speeds)
+        return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
@@ -274,7 +274,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         sample = _positive("sample", sample)
     else:
         by = decider(policy)
-        made = by if hasattr(by, "dt") else getattr(policy, "lin", None)
+        made = by if hasattr(by, "dt") else getattr(by, "lin", None)
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest = 0.0
     if not sample and follows:

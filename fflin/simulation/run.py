@@ -278,8 +278,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
     """Simulate a plan in Python; the progress bar of a long run shows `hint`."""
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
-    channel = None if law is None else plan.channel(law, lambda t, q, v: v[plan.wheels])
-    ask = partial(channel.begin, 0) if channel and not times.sample else None
+    applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
+    ask = partial(applied, 0) if applied and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
     follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt
@@ -306,7 +306,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.options.progress)
     try:
         for step in range(times.steps):
-            u = channel.begin(step, t, q, v) if channel else plan.initial
+            u = applied(step, t, q, v) if applied else plan.initial
             if step % times.every == 0:
                 record()
             stages, last = 0, t + latest

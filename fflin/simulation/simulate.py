@@ -284,7 +284,7 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            by, model = policy.terms, lin
+            by, model = policy.terms(), lin
             z: Array = np.zeros(len(by.A))
 
             def command(e: Array) -> Array:
@@ -321,8 +321,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if lin is None:  # a model in discrete time without its motion between samples
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = [lin.state_names.index(f"qdot_m.{name}") for name in plan.limits.wheel_names]
-    channel = plan.channel(foresees[1], speeds=lambda e: (x0 + e)[of])
+    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of their speeds in x
+    applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 
@@ -331,18 +331,18 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
-            rate = lin.A @ at + lin.B @ (channel.begin(0, at) - u0) + lin.f0
+            rate = lin.A @ at + lin.B @ (applied(0, at) - u0) + lin.f0
             after = after + weight * dt / 6.0 * rate
         return after
 
-    cuts = not sample and channel.cuts
+    cuts = not sample and plan.limits.cuts
     held = lin.discretize(dt) if sample else lin
     A, B, f0 = held.A, held.B, held.f0
     if not (sample or cuts):  # a step is then e -> A e + f0
         f0 = stepped(np.zeros(len(e)))
         A = np.column_stack([stepped(unit) - f0 for unit in np.eye(len(e))])
     for step in range(steps):
-        u = channel.begin(step, e) if sample else u0
+        u = applied(step, e) if sample else u0
         if step % every == 0:
             rows.append(e)
         e = stepped(e) if cuts else A.dot(e) + B.dot(u - u0) + f0

@@ -110,11 +110,10 @@ class ModelDerivatives:
         f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
         if self.lin.dt:
-            driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
-            for row in range(len(A)):
-                given = np.column_stack((B[row], f0[row]))
-                A[row], held = held_derivatives(self._source.A, driven, h, A[row], given)
-                B[row], f0[row] = held[:, :-1], held[:, -1]
+            driven = np.column_stack((self._source.B, self._source.f0))
+            given = np.concatenate((B, f0[..., None]), axis=2)
+            A[:], held = held_derivatives(self._source.A, driven, self.lin.dt, A, given)
+            B[:], f0[:] = held[..., :-1], held[..., -1]
         C, D, y0 = np.split(seen, (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
 

@@ -39,8 +39,9 @@ _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
 
-_GIF_FPS = 12
-_GIF_FRAMES = 96
+# Sizes [px] of a single picture of the whole page, of a picture in a strip, and of a GIF.
+_PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
+_GIF_FPS, _GIF_FRAMES = 12, 96
 
 
 def find_chromium() -> str:
@@ -54,29 +55,28 @@ def find_chromium() -> str:
     return found
 
 
-def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes:
+def take_png(page: str, times: Sequence[float]) -> bytes:
     """Return a PNG of a motion's page at one time [s], or a strip of several pictures."""
-    frames = _film(page, times, size, 1 if len(times) > 1 else -1)
-    if len(frames) == 1:
-        return frames[0]
+    if len(times) == 1:
+        return _film(page, times, _PICTURE, -1)[0]
     from PIL import Image
 
-    strip = Image.new("RGB", (size[0] * len(frames), size[1]))
-    for index, frame in enumerate(frames):
-        strip.paste(Image.open(io.BytesIO(frame)), (index * size[0], 0))
+    width, height = _STRIP
+    strip = Image.new("RGB", (width * len(times), height))
+    for index, frame in enumerate(_film(page, times, _STRIP, 1)):
+        strip.paste(Image.open(io.BytesIO(frame)), (index * width, 0))
     content = io.BytesIO()
     strip.save(content, "PNG", optimize=True)
     return content.getvalue()
 
 
-def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
+def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
     """Return a GIF of a motion's page over a time span [s]; long spans are shown faster."""
     from PIL import Image
 
-    start, duration = span[0], span[1] - span[0]
-    count = round(max(2, min(_GIF_FRAMES, duration / speed * _GIF_FPS)))
-    times = [start + duration * index / (count - 1) for index in range(count)]
-    frames = _film(page, times, size, len(times))
+    count = round(max(2, min(_GIF_FRAMES, (end - start) / speed * _GIF_FPS)))
+    times = [start + (end - start) * index / (count - 1) for index in range(count)]
+    frames = _film(page, times, _GIF, count)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -87,7 +87,7 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
     return content.getvalue()
 
 
-def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
+def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
     """Return a PNG of the page at each time.
 
     The pictures show only the scene; the first `keys` of them also show a legend. If `keys` is
@@ -95,10 +95,12 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
     """
     program = find_chromium()
     try:
-        with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
+        with _browser(program, _PATIENCE + 3.0 * len(times)) as (browser, folder):
+            file = Path(folder, "page.html")
+            file.write_text(page, encoding="utf-8")
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
             browser.tell("Emulation.setDeviceMetricsOverride", **metrics)
-            browser.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
+            browser.tell("Page.navigate", url=file.resolve().as_uri() + "#pause")
             while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
                 time.sleep(0.05)
             shots = []
@@ -115,12 +117,12 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) 
                 shots.append(base64.b64decode(shot["data"]))
             return shots
     except (OSError, _BrowserError) as error:
-        raise FileError(f"{program} cannot take a picture of {page}: {error}") from None
+        raise FileError(f"{program} cannot take a picture of the page: {error}") from None
 
 
 @contextmanager
-def _browser(program: str, patience: float) -> Iterator[_Browser]:
-    """Run a browser for at most `patience` seconds, and then remove its temporary files."""
+def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
+    """Run a browser for at most `patience` seconds; then remove the folder of temporary files."""
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
@@ -142,7 +144,7 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
             try:
                 timer.start()
                 browser = _Browser(process)
-                yield browser
+                yield browser, folder
                 with suppress(_BrowserError, subprocess.TimeoutExpired):
                     # Close the browser before killing it, because only a closed browser removes its
                     # temporary files.

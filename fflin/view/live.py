@@ -9,6 +9,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from time import monotonic, sleep
 from typing import TypeAlias
 
@@ -21,8 +22,9 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
+from fflin.robot.fields import travel_of
 from fflin.robot.robot import Robot
-from fflin.view.page import Page, body_poses, subtitle
+from fflin.view.page import Page, body_poses
 
 _HOST = "127.0.0.1"
 
@@ -60,10 +62,10 @@ class Live:
         # Clock time and simulation time [s] at the first shown step of a simulation.
         self._began: tuple[float, float] | None = None
         self._running, self._state, self._clients = False, "{}", set[_Socket]()
-        self._page, page.window.forward = page, self._send
-        self.meshcat, self.notes = page.meshcat, page.drawing.notes
+        self._page, page.window.forward = page, partial(self._each, _Socket.send)
+        self.meshcat, self.notes = page.meshcat, tuple(page.notes)
         poses = body_poses(robot, q)
-        page.set_stage(poses, subtitle(robot))
+        page.set_stage(poses)
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         sliders = [
             {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
@@ -75,7 +77,6 @@ class Live:
             follow=bool(follow),
             joints=sliders,
             names=[*axes, *robot.joint_names],
-            bodies=page.nodes,
         )
         try:
             listener = socket.create_server((_HOST, port), backlog=128)
@@ -172,12 +173,9 @@ class Live:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _send(self, message: bytes) -> None:
-        """Send a message to every browser."""
-        self._each(lambda client: client.send(message))
-
-    def _each(self, what: Callable[[_Socket], object]) -> None:
-        self._call(lambda: [what(client) for client in list(self._clients)])
+    def _each(self, what: Callable[..., object], *arguments: object) -> None:
+        """Call a method of the connection to every browser."""
+        self._call(lambda: [what(client, *arguments) for client in list(self._clients)])
 
     def _call(self, what: Callable[[], object]) -> None:
         if self._running:
@@ -202,15 +200,11 @@ def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
     """Return {joint: range of its slider [rad|m|kg^0.5 m]} for all joints except wheels."""
     found = {}
     for joint in robot.joints:
-        high = 1.0 if joint.prismatic else np.pi
-        low = -high
-        if not joint.unbounded:
-            low = max(float(robot.model.lowerPositionLimit[joint.idx_q]), low)
-            high = min(float(robot.model.upperPositionLimit[joint.idx_q]), high)
-            if not low < high:
-                low, high = low - 1.0, low + 1.0
+        most = 1.0 if joint.prismatic else np.pi
+        least, largest = travel_of(robot.model, joint)
+        low, high = max(least, -most), min(largest, most)
         if joint.name not in robot.wheels:
-            found[joint.name] = low, high
+            found[joint.name] = (low, high) if low < high else (low - 1.0, low + 1.0)
     return found
 
 
@@ -268,18 +262,13 @@ class _Socket(_Guarded, WebSocketHandler):
             return None
 
     def update(self) -> None:
-        if self._busy:
-            self._behind = True
-            return
-        sent = self.send(self._live._state)
-        if sent is None:
-            return
-        self._busy = True
+        self._behind = self._busy
+        sent = None if self._busy else self.send(self._live._state)
+        if sent:
+            self._busy = True
+            sent.add_done_callback(self._arrived)
 
-        def done(future: asyncio.Future[None]) -> None:
-            self._busy = False
-            if future.exception() is None and self._behind:
-                self._behind = False
-                self.update()
-
-        sent.add_done_callback(done)
+    def _arrived(self, sent: asyncio.Future[None]) -> None:
+        self._busy = False
+        if sent.exception() is None and self._behind:
+            self.update()

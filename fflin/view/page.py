@@ -105,36 +105,34 @@ def body_poses(robot: Robot, q: Array) -> Array:
 
 
 class Drawing:
-    """Drawing of a robot below a node of a meshcat scene, with a child node for each body."""
+    """Drawing of a robot below a node of a page's scene, with a child node for each body.
+
+    The page receives the links of a robot that is drawn as `real` or `held`, and notes about
+    missing drawings.
+    """
 
     def __init__(
-        self,
-        robot: Robot,
-        visualizer: Visualizer,
-        look: str = "real",
-        sent: set[str] | None = None,
-        prefix: str = "",
+        self, page: Page, robot: Robot, node: str, look: str = "real", prefix: str = ""
     ) -> None:
-        self.robot, self.prefix = robot, prefix
-        self._visualizer = visualizer
+        self.prefix, self._visualizer = prefix, page.meshcat[node]
         # Name of each body's node, in the order of Pinocchio's joints (without the universe).
         self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
-        sent = set() if sent is None else sent  # meshes that were sent to the page, updated below
-        found, self.notes = shapes(robot)  # shapes, and notes about missing drawings
-        self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
+        found, notes = shapes(robot)
+        if robot.urdf or not prefix:  # boxes are the normal drawing of a payload without a URDF
+            page.notes |= dict.fromkeys(notes)
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
-            node = visualizer[self.paths[shape.joint - ROOT]]
+            body = self._visualizer[self.paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
                 about: dict[str, object] = {"finish": shape.finish, "color": color, "look": look}
                 if look in ("real", "held"):
                     about["link"] = link = ".".join(filter(None, (prefix, shape.link)))
-                    self.links.setdefault(link, _link(robot, shape))
+                    page.links[link] = _link(robot, shape)
                 identity = str(geometry["uuid"])
-                shown = _ELSEWHERE if identity in sent else geometry
+                shown = _ELSEWHERE if identity in page.sent else geometry
                 if geometry["type"] == "BufferGeometry":
                     about["mesh"] = identity
-                    sent.add(identity)
+                    page.sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
                 # A three.js mesh. The page replaces the placeholders by its own material and
                 # meshes.
@@ -151,7 +149,7 @@ class Drawing:
                         "userData": about,
                     },
                 }
-                self._send("set_object", node[f"{index}_{part}"], object=content)
+                self._send("set_object", body[f"{index}_{part}"], object=content)
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
         self.bodies = list(corners)  # Pinocchio joints
         self.corners = [
@@ -324,19 +322,17 @@ def subtitle(robot: Robot) -> str:
 
 
 class Page:
-    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read.
-
-    `entries` contains this data. `set_stage` computes its first part from the first frame.
-    """
+    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read."""
 
     def __init__(self, robot: Robot, scene: str, tool: str | None, frame: str | None) -> None:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
-        self.window, self._sent = Recorder(), set[str]()
+        self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
         self.meshcat = Visualizer(window=self.window)
-        self.drawing = self.draw(robot, "robot")
+        self.notes = dict[str, None]()  # about missing drawings
+        self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
+        self.drawing = Drawing(self, robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints (without the universe).
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
-        self.entries: dict[str, object] = {}
         # For each thruster: its name, node, position and direction of its force.
         self.nozzles: list[dict[str, object]] = []
         for item, (name, *_) in named_inputs(robot.inputs):
@@ -346,22 +342,20 @@ class Page:
                 nozzle["position"] = placement.act(np.array(item.position)).tolist()
                 nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
                 self.nozzles.append(nozzle)
-        self.floor = [0.0, 0.0, 0.0]  # [m] point of the floor below the robot
+        self.floor, self.centre = np.zeros(3), np.zeros(3)  # [m] `floor` is below the robot
         self.size = 1.0  # [m] radius of the robot in the first frame
 
-    def draw(self, robot: Robot, node: str, look: str = "real", prefix: str = "") -> Drawing:
-        """Draw a robot below a node of the scene."""
-        return Drawing(robot, self.meshcat[node], look, self._sent, prefix)
-
-    def set_stage(self, poses: Array, about: str, held: Sequence[Drawing] = ()) -> None:
-        """Set `entries`, given the poses (njoints - 1, 7) in the first frame."""
-        robot, nodes = self.robot, self.nodes
+    def set_stage(self, poses: Array) -> None:
+        """Set the floor, centre and size from the poses (njoints - 1, 7) in the first frame."""
         points = self.drawing.points(poses)
         low, high = points.min(axis=0), points.max(axis=0)
-        centre = (low + high) / 2.0
-        size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
-        self.size, self.floor = size, [*centre[:2].tolist(), float(low[2])]
-        orbit: dict[str, object] = {}
+        self.centre = (low + high) / 2.0
+        self.size = max(float(np.linalg.norm(points - self.centre, axis=1).max()), 1e-3)
+        self.floor = np.array([*self.centre[:2], low[2]])
+
+    def html(self, mode: str, points: Array, **entries: object) -> str:
+        """Return the page with additional entries; its camera shows all points (M, 3)."""
+        robot, nodes, orbit = self.robot, self.nodes, dict[str, object]()
         if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
             # On the page, z points away from the central body, and x along the orbit.
@@ -380,33 +374,28 @@ class Page:
         for name, wheel in named:
             joint, at = find_frame(robot.model, wheel.frame)
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
-            apart = _APART * size * (several.count(wheel.frame) > 1)
+            apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
             # If the speed of the wheel is a state, the wheel rotates with the node of its joint.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
-        self.entries = {
-            **orbit,
-            "triads": triads,
-            "nozzles": self.nozzles,
-            "wheels": wheels,
-            "links": {k: link for each in (self.drawing, *held) for k, link in each.links.items()},
-            "title": robot.name,
-            "subtitle": about,
-            "scene": self.scene,
-            "size": size,
-            "centre": centre.tolist(),
-            "base": nodes[0],
-        }
-
-    def html(self, mode: str, points: Array, **entries: object) -> str:
-        """Return the page with additional entries; its camera shows all points (M, 3)."""
         # A live page receives its commands from the server. Other pages contain them and open no
         # connection.
         live, digits = mode == "live", max(4, 4 - math.floor(math.log10(self.size)))
         info = {
-            **self.entries,
-            "floor": self.floor,
+            **orbit,
+            "triads": triads,
+            "nozzles": self.nozzles,
+            "wheels": wheels,
+            "links": self.links,
+            "title": robot.name,
+            "subtitle": subtitle(robot),
+            "scene": self.scene,
+            "size": self.size,
+            "centre": self.centre.tolist(),
+            "base": nodes[0],
+            "bodies": nodes,
+            "floor": self.floor.tolist(),
             "mode": mode,
             "points": points.round(digits).tolist(),
             **entries,
@@ -416,17 +405,14 @@ class Page:
         # begin with "<", which is therefore escaped.
         data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
         fields = {
-            "title": escape(self.robot.name),
+            "title": escape(robot.name),
             "scene": self.scene,
             "mode": mode,
             "connect": "'self' ws:" if live else "'none'",
             **_fixed(),
             "data": data,
         }
-        parts = _asset("page.html").split("{{")
-        return parts[0] + "".join(
-            fields[name] + rest for name, _, rest in (part.partition("}}") for part in parts[1:])
-        )
+        return re.sub(r"{{(\w+)}}", lambda field: fields[field[1]], _asset("page.html"))
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:

@@ -56,15 +56,9 @@ _NONE = np.zeros(0)
 
 
 def motion_page(
-    page: Page,
-    motion: Motion,
-    *,
-    fps: float,
-    speed: float,
-    follow: bool | None,
-    target: Array | None,
-) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a motion, and notes about parts that are not drawn; see `visualize`."""
+    page: Page, motion: Motion, fps: float, speed: float, follow: bool | None, target: Array | None
+) -> str:
+    """Return the page of a motion; see `visualize`."""
     robot, shown = page.robot, frame_indices(motion.t, fps, speed)
     frame = cast("Frame", motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
@@ -72,23 +66,23 @@ def motion_page(
     if target is None:  # none, one, or one for each frame
         states = motion.target.reshape(-1, state.nx)
         states = states[shown] if len(states) > 1 else states
-        goal = np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, robot.nq)
+        goal = state.points(states)[1]
     else:
         goal = target[None]
     goals = body_poses(robot, goal)
 
-    drawing, moving = page.drawing, [(page.drawing, film.poses)]
+    moving = [(page.drawing, film.poses)]
     if len(goals):
-        ghost = page.draw(robot, "target", "ghost")
+        ghost = Drawing(page, robot, "target", "ghost")
         ghost.place(goals[0])
         moving += [(ghost, goals)] if len(goals) > 1 else []
     if motion.linear is not None:
-        predicted = np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
-        moving.append((page.draw(robot, "linear", "linear"), body_poses(robot, predicted)))
+        predicted = state.points(motion.linear[shown])[1]
+        moving.append((Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted)))
     held = []
     for caught, poses in payloads(motion, frame, shown):
         name = caught.prefix
-        held.append((page.draw(caught.payload, f"held/{name}", "held", name), poses))
+        held.append((Drawing(page, caught.payload, f"held/{name}", "held", name), poses))
     moving += held
     clips = []
     for each, poses in moving:
@@ -104,9 +98,9 @@ def motion_page(
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
-    page.set_stage(film.poses[0], about[0], [each for each, _ in held])
+    page.set_stage(film.poses[0])
     corners = [frame_points(page, film)]
-    for each, rows in ((drawing, goals), *held):
+    for each, rows in ((page.drawing, goals), *held):
         corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
     points = np.concatenate(corners)
     page.floor[2] = float(points[:, 2].min())
@@ -115,9 +109,10 @@ def motion_page(
         follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
         points = frame_points(page, film, follow=True)
-    html = page.html(
+    return page.html(
         "motion",
         points,
+        subtitle=about[0],
         **panel(robot, motion, shown, goal),
         **marks(page, film, goals[:1] if motion.phases else goals),
         t=packed(t),
@@ -128,8 +123,6 @@ def motion_page(
         phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
         held=[each.prefix for each, _ in held],
     )
-    drawn = [drawing, *(each for each, _ in moving[1:] if each.robot.urdf)]
-    return html, tuple(dict.fromkeys(note for each in drawn for note in each.notes))
 
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
@@ -346,8 +339,8 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
     }
 
 
-def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a robot's modes, and notes about parts that are not drawn."""
+def mode_page(page: Page, found: Modes) -> str:
+    """Return the page of a robot's modes."""
     robot, lin = page.robot, found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
@@ -363,8 +356,8 @@ def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
         )
     at_rest = body_poses(robot, lin.q)
     page.drawing.place(at_rest)
-    page.draw(robot, "rest", "ghost").place(at_rest)
-    page.set_stage(at_rest, f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}")
+    Drawing(page, robot, "rest", "ghost").place(at_rest)
+    page.set_stage(at_rest)
     swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
     points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
     modes = [
@@ -378,9 +371,9 @@ def mode_page(page: Page, found: Modes) -> tuple[str, tuple[str, ...]]:
         }
         for mode, poses in zip(found.vibrations, swings, strict=True)
     ]
+    about = f"{subtitle(robot)}, {counted(len(modes), 'vibration')}"
     corners = np.concatenate(points)
-    html = page.html("modes", corners, period=_PERIOD, bodies=page.nodes, modes=modes)
-    return html, page.drawing.notes
+    return page.html("modes", corners, subtitle=about, period=_PERIOD, modes=modes)
 
 
 def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 SCENES = ("space", "lab")
 
-# Sizes [px] of a single picture of the whole page, of a picture in a strip, and of a GIF.
-_PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
-
 # Longest duration of an animation [s]; longer motions are shown faster.
 _LONGEST = 60.0
 
@@ -172,7 +169,7 @@ def visualize(
         pace = positive("speed", 1.0 if speed is None else speed)
         page = Page(robot, scene, tool, frame)
         live = Live(page, start, follow=follow, speed=pace, port=port)
-        for note in live.notes:
+        for note in page.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
             live.open()
@@ -188,15 +185,16 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        found, notes = mode_page(Page(robot, scene, tool, motion.lin.frame), motion)
+        page = Page(robot, scene, tool, motion.lin.frame)
+        found = mode_page(page, motion)
     else:
         robot = _robot_of(robot, motion)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
         goal = None if target is None else _configuration(robot, "target", target)
         page = Page(robot, scene, tool, motion.frame)
-        found, notes = motion_page(page, motion, fps=fps, speed=speed, follow=follow, target=goal)
+        found = motion_page(page, motion, fps, speed, follow, goal)
         contents = _pictures(found, outputs, motion, speed, times)
-    for note in notes:
+    for note in page.notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
     write_atomically(contents | ({shown: found.encode()} if shown else {}))
@@ -310,12 +308,8 @@ def _pictures(
         times = [start + fraction * (end - start) for fraction in fractions]
     times = check_times(times, start, end)
     contents = {}
-    with tempfile.TemporaryDirectory(prefix="fflin-") as folder:
-        file = Path(folder, "page.html")
-        file.write_text(page, encoding="utf-8")
-        if ".png" in outputs:
-            size = _PICTURE if len(times) == 1 else _STRIP
-            contents[outputs[".png"]] = take_png(file, times, size)
-        if ".gif" in outputs:
-            contents[outputs[".gif"]] = take_gif(file, (start, end), speed, _GIF)
+    if ".png" in outputs:
+        contents[outputs[".png"]] = take_png(page, times)
+    if ".gif" in outputs:
+        contents[outputs[".gif"]] = take_gif(page, start, end, speed)
     return contents

@@ -174,7 +174,7 @@ def test_an_error_leaves_stdout_empty_and_a_failed_check_prints_json(python):
 
 
 def test_what_is_not_finite_is_null():
-    from fflin.commands.results import plain
+    from fflin.commands.cli import plain
 
     assert plain({"a": np.array([1.0, np.inf]), "_b": 1}) == {"a": [1.0, None]}
     assert plain(np.array([1.0 + 2.0j])) == [{"real": 1.0, "imag": 2.0}]

@@ -143,7 +143,7 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
         # The linear loop from sample to sample: the error e, and its estimate z.
         e, z, rows = flown.error[0], np.zeros(len(seen.state_names)), [flown.error[0]]
         for k, (A, B, C, D) in enumerate(zip(gains.A, gains.B, seen.C, seen.D, strict=False)):
-            by = policy._sample(k * SAMPLE)
+            by = policy.terms(k * SAMPLE)
             u = by.C @ z
             z = by.A @ z + by.B @ (C @ e + D @ u)
             e = A @ e + B @ u
@@ -156,7 +156,7 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
     # From the motion at the end, which is none of rest, to rest.
     assert np.abs(on.v[128]).max() > 0.3
     assert np.abs(on.error[-1]).max() < 1e-3
-    jump = policy._sample(policy.duration).jump
+    jump = policy.terms(policy.duration).jump
     moved = fflin.StateMap(robot, frame="local").velocities(on.v[128])
     np.testing.assert_allclose(jump[len(jump) // 2 :], moved, atol=1e-9)
 

@@ -8,12 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.optimal.differential_riccati import (
-    Coefficients,
-    Transition,
-    solve_back,
-    transition,
-)
+from fflin.control.optimal.differential_riccati import solve_back, stepped_back, transitions
 from fflin.dynamics.integrators import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
@@ -129,13 +124,13 @@ def test_a_step_is_of_order_four():
     def at(t):
         t = np.asarray(t)[:, None, None]
         B = (1 - t) * B0 + t * B1
-        return Coefficients((1 - t) * A0 + t * A1, B @ B.mT, np.tile(np.eye(4), (len(t), 1, 1)))
+        return np.array(((1 - t) * A0 + t * A1, B @ B.mT, np.tile(np.eye(4), (len(t), 1, 1))))
 
     def solved(steps):
         P, h = np.eye(4), 1.0 / steps
         for k in range(steps, 0, -1):
             early, late = (at([(k - 1 + c) * h]) for c in nodes)
-            P = Transition(*(x[0] for x in transition(early, late, np.array([h])))).back(P)
+            P = stepped_back(transitions(early, late, np.array([h]))[:, 0], P)
         return P
 
     exact = solved(256)
@@ -149,7 +144,7 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
 
     def at(t):
         S = np.exp(12.0 * (1.0 - t))[:, None, None]
-        return Coefficients(0.0 * S, S, 0.0 * S + 1e-6)
+        return np.array((0.0 * S, S, 0.0 * S + 1e-6))
 
     times, values = solve_back(at, np.array([0.0, 1.0]), 1e3 * np.eye(1))
     found = solve_ivp(
@@ -160,8 +155,8 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         rtol=1e-10,
         atol=1e-14,
     )
-    single = transition(*(at(np.array([c])) for c in GAUSS), np.ones(1))
-    assert np.abs(single.back(1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
+    single = transitions(*(at(np.array([c])) for c in GAUSS), np.ones(1))[:, 0]
+    assert np.abs(stepped_back(single, 1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
     assert times[0] == 0.0
     assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
 

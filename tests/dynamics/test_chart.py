@@ -56,6 +56,6 @@ def test_rows_are_turned_where_they_stand_and_there_and_back():
     assert chart.to_base(parts, turned) == pytest.approx(x, rel=1e-13)
     columns = x.T.copy()
     chart.turn_rows(parts, x)
-    chart.turn_columns(parts, columns)
+    chart.turn_rows(parts, columns.T)
     assert (x == turned).all()
     assert columns == pytest.approx(turned.T, rel=1e-14)

@@ -426,7 +426,7 @@ def test_states_names_and_units():
     assert not sensing.needs_acceleration
     q, v, a = point(robot, np.random.default_rng(9))
     sensed = sensing.evaluate(robot.create_data(), q, v, np.full(robot.nv, np.nan))
-    assert sensed.by_a is None
+    assert sensed.by_a.shape == sensed.by_v.shape and not sensed.by_a.any()
     assert not any(part[rows].any() for part in sensed[:3])
     assert not any(np.isnan(part).any() for part in sensed[:3])
 

@@ -21,7 +21,6 @@ from fflin.kernel.tree import (
     Struct,
     empty,
     laid_out,
-    words_of,
 )
 from fflin.kernel.vectors import called
 
@@ -64,8 +63,9 @@ def test_every_kind_of_field_is_read_where_it_stands():
         real = (of.reals[1], of.lanes[1, 7], of.inner.share, of.more.share, of.more.values[2])
         return whole, real, (of.on, of.flags[1], of.flags[2])
 
-    value = laid_out(VALUE, OUTER)
-    whole, real, flags = read(words_of(value, OUTER))
+    value, words, _ = laid_out(VALUE, OUTER)
+    whole, real, flags = read(words)
+    assert value.lanes.shape == (2, 8)
     assert whole == (-3, 6, 5, 0, 3)
     assert real == (2.0, 8.0, -1e-300, np.inf, 3.0)
     assert flags == (True, False, True)
@@ -80,29 +80,27 @@ def test_what_is_written_in_compiled_code_stands_in_the_arrays():
         of.lanes[0, 3] = of.more.values[0] = 9.0
         of.indices[0] = of.count
 
-    fresh = []
-    value = laid_out(VALUE, OUTER, lambda *pair: fresh.append(pair))
-    write(words_of(value, OUTER))
+    value, words, fresh = laid_out(VALUE, OUTER)
+    write(words)
     assert value.lanes[0].tolist() == [7.0] * 3 + [9.0] + [7.0] * 4
     assert value.more.values[0] == 9.0 and value.indices[0] == -3
     (array, before), *others = fresh
     assert array is value.lanes and before.tolist() == [[7.0], [8.0]] and not others
 
 
-def test_arrays_of_another_kind_are_refused():
-    value = laid_out(VALUE, OUTER)
-    for wrong in (value.reals.astype(np.float32), value.reals[:, None], value.indices):
-        with pytest.raises(AssertionError):
-            words_of(value._replace(reals=wrong), OUTER)
+def test_arrays_are_converted_to_their_kind_or_refused():
+    for reals in (np.array([0.5, 2.0], np.float32), np.array([0.5, 9.0, 2.0, 9.0])[::2]):
+        value, words, _ = laid_out(VALUE._replace(reals=reals), OUTER)
+        assert value.reals.dtype == float and value.reals.flags.c_contiguous
+        assert value.reals.tolist() == [0.5, 2.0] and words[2] == value.reals.ctypes.data
     with pytest.raises(AssertionError):
-        words_of(value._replace(reals=np.zeros(4)[::2]), OUTER)
+        laid_out(VALUE._replace(reals=np.zeros((2, 1))), OUTER)
 
 
 def test_an_empty_value_has_all_fields():
-    value = empty(OUTER)
+    value, words, fresh = laid_out(empty(OUTER), OUTER)
     assert value.count == 0 and value.lanes.shape == (0, 8) and value.table.shape == (0, 0)
-    assert laid_out(value, OUTER) is value and value.inner is value.more
-    assert len(words_of(value, OUTER)) == OUTER.size == 20
+    assert len(words) == OUTER.size == 20 and len(fresh) == 1
 
 
 @called

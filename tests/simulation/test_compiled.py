@@ -361,12 +361,11 @@ class Kept(lanes.Statistics):
 
 def test_arguments_are_laid_out_or_refused():
     given = loop.Wheels(*(np.array([k]) for k in range(7)))
-    wheels = tree.laid_out(given, loop.WHEELS)
+    wheels, words, _ = tree.laid_out(given, loop.WHEELS)
     assert wheels.at.dtype == np.intp and wheels.stiffness.dtype == float
-    words = tree.words_of(wheels, loop.WHEELS)
     assert len(words) == loop.WHEELS.size == 14 and words[1::2].tolist() == [1] * 7
     with pytest.raises(AssertionError):
-        tree.words_of(given, loop.WHEELS)
+        tree.laid_out(given._replace(at=np.zeros((1, 1))), loop.WHEELS)
 
 
 def test_a_command_that_is_no_number_is_told(robots):

@@ -82,9 +82,10 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
 def test_the_page_of_modes_plays_the_arrays():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
     found = fflin.modes(fflin.linearize(robot))
-    page, notes = mode_page(Page(robot, "space", None, found.lin.frame), found)
-    assert not notes
-    packed = re.findall(r'"poses":"([^"]+)"', page)
+    page = Page(robot, "space", None, found.lin.frame)
+    html = mode_page(page, found)
+    assert not page.notes
+    packed = re.findall(r'"poses":"([^"]+)"', html)
     assert len(packed) == len(found.vibrations)
     arrays = [robot.model.getJointId(f"{side}_mode_1") - ROOT for side in ("left", "right")]
     swings = []

@@ -42,7 +42,7 @@ def test_pictures(robots, motion, tmp_path):
 def test_along_a_trajectory_pictures_are_taken_all_the_way(robots, motion, tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: "")
-    monkeypatch.setattr("fflin.view.capture.take_png", lambda _, at, size: taken.append(at) or b"")
+    monkeypatch.setattr("fflin.view.capture.take_png", lambda _, at: taken.append(at) or b"")
     for each in (motion, led(motion)):
         fflin.visualize(robots["planar_detumble"], each, png=tmp_path / "m.png")
     np.testing.assert_allclose(taken, np.array([[0, 0.08, 0.25, 1.0], [0, 0.35, 0.7, 1.0]]) * 4.0)

@@ -160,7 +160,7 @@ def test_meshes_are_found_where_urdfs_say(tmp_path):
 
 
 def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
-    from fflin.view.page import Drawing, Recorder, Visualizer
+    from fflin.view.page import Page
 
     tetrahedron(tmp_path / "t.stl")
     path = write(
@@ -172,9 +172,8 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     corners = np.array([[0, 0, 0], [0.5, 0, 0], [0, -2, 0], [0, 0, 3.0]])
     theirs = np.array([placement.act(corner) for corner in corners])
 
-    window = Recorder()
-    Drawing(fflin.load(path), Visualizer(window=window)["robot"])
-    pieces = [umsgpack.unpackb(each) for each in window.commands()]
+    page = Page(fflin.load(path), "space", None, None)
+    pieces = [umsgpack.unpackb(each) for each in page.window.commands()]
     pieces = [each["object"] for each in pieces if each["type"] == "set_object"]
     (piece,) = (each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry")
     data = piece["geometries"][0]["data"]["attributes"]["position"]["array"].data

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm, matrix_balance
@@ -23,115 +22,93 @@ _KNOTS_LIMIT = 100_000
 _BATCH = 64
 
 
-class Coefficients(NamedTuple):
-    """Coefficients (.., nx, nx) of ``-dP/dt = A' P + P A - P S P + Q``, with ``S = B R^-1 B'``."""
-
-    A: Array
-    S: Array
-    Q: Array
-
-    def rate(self, P: Array) -> Array:
-        """Return dP/dt."""
-        drift = P @ self.A
-        return P @ self.S @ P - drift - drift.T - self.Q
+def rate(coefficients: Array, P: Array) -> Array:
+    """Return dP/dt = P S P - A' P - P A - Q, with the coefficients A, S = B R^-1 B' and Q."""
+    A, S, Q = coefficients
+    drift = P @ A
+    return P @ S @ P - drift - drift.T - Q
 
 
-class Transition(NamedTuple):
-    r"""Solution of the Hamiltonian system over intervals.
+def joined(early: Array, late: Array) -> Array:
+    """Return the transitions over `early` intervals and then over `late` intervals."""
+    (T, G, W), (T_late, G_late, W_late) = early, late
+    n = T.shape[-1]
+    right = np.concatenate((T, G @ T_late.mT), axis=-1)
+    inner = np.linalg.solve(np.eye(n) + G @ W_late, right)
+    forward, back = inner[..., :n], inner[..., n:]
+    G, W = G_late + T_late @ back, W + T.mT @ W_late @ forward
+    return np.array((T_late @ forward, _symmetric(G), _symmetric(W)))
 
-    The solution is ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1``, with the states x0, x1 and the
-    costates l0, l1 at the start and at the end of an interval. G and W are positive semidefinite.
+
+def stepped_back(transition: Array, P: Array) -> Array:
+    """Return P at the start of the interval, W + T' P (I + G P)^-1 T, from P at its end."""
+    T, G, W = transition
+    forward = np.linalg.solve(np.eye(len(P)) + G @ P, T)
+    costate = P @ forward
+    # Every term is positive semidefinite, so P stays positive semidefinite.
+    return _symmetric(W + forward.T @ costate + costate.T @ G @ costate)
+
+
+def transitions(early: Array, late: Array, h: Array) -> Array:
+    r"""Return fourth-order transitions over k intervals, from coefficients at the Gauss nodes.
+
+    The coefficients (3, k, nx, nx) are A, S and Q. The transitions (3, k, nx, nx) are the matrices
+    T, G and W of the solution ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1`` of the Hamiltonian
+    system, with the states x0, x1 and the costates l0, l1 at the start and at the end of an
+    interval. G and W are positive semidefinite.
     """
-
-    T: Array
-    G: Array
-    W: Array
-
-    def then(self, late: Transition) -> Transition:
-        """Return the transition over these intervals and then over the `late` intervals."""
-        T, G, W = self
-        n = T.shape[-1]
-        right = np.concatenate((T, G @ late.T.mT), axis=-1)
-        inner = np.linalg.solve(np.eye(n) + G @ late.W, right)
-        forward, back = inner[..., :n], inner[..., n:]
-        return Transition(
-            late.T @ forward,
-            _symmetric(late.G + late.T @ back),
-            _symmetric(W + T.mT @ late.W @ forward),
-        )
-
-    def back(self, P: Array) -> Array:
-        """Return P at the start of the interval, W + T' P (I + G P)^-1 T, from P at its end."""
-        forward = np.linalg.solve(np.eye(len(P)) + self.G @ P, self.T)
-        costate = P @ forward
-        # Every term is positive semidefinite, so P stays positive semidefinite.
-        return _symmetric(self.W + forward.T @ costate + costate.T @ self.G @ costate)
+    mixed = np.concatenate((HEAVY * early + LIGHT * late, LIGHT * early + HEAVY * late), axis=1)
+    both = _constant(mixed, 0.5 * np.concatenate((h, h)))
+    return joined(both[:, : len(h)], both[:, len(h) :])
 
 
-def transition(early: Coefficients, late: Coefficients, h: Array) -> Transition:
-    """Return fourth-order transitions (k,) over intervals, from coefficients at the Gauss nodes."""
-    pairs = zip(early, late, strict=True)
-    mixed = [np.concatenate((HEAVY * a + LIGHT * b, LIGHT * a + HEAVY * b)) for a, b in pairs]
-    both = _constant(Coefficients(*mixed), 0.5 * np.concatenate((h, h)))
-    first, second = (
-        Transition(*each) for each in zip(*(np.split(x, 2) for x in both), strict=True)
-    )
-    return first.then(second)
-
-
-def _constant(coefficients: Coefficients, h: Array) -> Transition:
+def _constant(coefficients: Array, h: Array) -> Array:
     """Return transitions for constant coefficients, by a matrix exponential and doubling."""
     A, S, Q = coefficients
-    n, (a, s, q) = A.shape[-1], (np.abs(x).max(axis=0) for x in coefficients)
+    n, (a, s, q) = A.shape[-1], np.abs(coefficients).max(axis=1)
     sizes = np.block([[a, s], [q, a.T]])
     if not sizes.max() < 1e300:
         raise np.linalg.LinAlgError("the coefficients are too large")
     # Scale the states so that rows and columns have similar sizes; costates get inverse scales.
     _, (scale, _) = matrix_balance(sizes, permute=False, separate=True)
     unit = np.sqrt(scale[:n] / scale[n:])
-    A, S, Q = A * unit / unit[:, None], S / np.outer(unit, unit), Q * np.outer(unit, unit)
-    lower = np.concatenate((-Q, -A.mT), axis=-1)
-    H = np.concatenate((np.concatenate((A, -S), axis=-1), lower), axis=-2) * h[:, None, None]
+    of_costs, of_states = np.outer(unit, unit), unit / unit[:, None]
+    A, S, Q = A * of_states, S / of_costs, Q * of_costs
+    H = np.block([[A, -S], [-Q, -A.mT]]) * h[:, None, None]
     size = float(np.abs(H).sum(axis=-2).max())
     doublings = max(0, math.ceil(math.log2(max(size, 1.0))))
     theta = expm(H / 2**doublings)
     inverse = np.linalg.inv(theta[:, n:, n:])
-    found = Transition(
-        inverse.mT,
-        _symmetric(-theta[:, :n, n:] @ inverse),
-        _symmetric(-inverse @ theta[:, n:, :n]),
-    )
+    G, W = -theta[:, :n, n:] @ inverse, -inverse @ theta[:, n:, :n]
+    found = np.array((inverse.mT, _symmetric(G), _symmetric(W)))
     for _ in range(doublings):
-        found = found.then(found)
+        found = joined(found, found)
     T, G, W = found
-    scale = np.outer(unit, unit)
-    return Transition(T * unit[:, None] / unit, G * scale, W / scale)
+    return np.array((T / of_states, G * of_costs, W / of_costs))
 
 
 # An interval: its start and end, its transitions (over the whole interval, the first half, and the
 # second half), and the coefficients at both ends.
-_Interval = tuple[float, float, Transition, Transition, Transition, Coefficients, Coefficients]
+_Interval = tuple[float, float, Array, Array]
 
 
-def _intervals(at: Callable[[Array], Coefficients], knots: Array) -> list[_Interval]:
+def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     """Return the k intervals between knots (k + 1,), with their transitions."""
     a, b, count = knots[:-1], knots[1:], len(knots) - 1
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
     h = np.concatenate((b, middle, b)) - start
     found = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
-    early, late, ends = zip(*(np.split(x, (3 * count, 6 * count)) for x in found), strict=True)
-    mapped = transition(Coefficients(*early), Coefficients(*late), h)
-    maps = [Transition(*x) for x in zip(*mapped, strict=True)]
-    of_knots = [Coefficients(*x) for x in zip(*ends, strict=True)]
-    times, parts = knots.tolist(), (maps[:count], maps[count : 2 * count], maps[2 * count :])
-    return list(zip(times[:-1], times[1:], *parts, of_knots[:-1], of_knots[1:], strict=True))
+    early, late, ends = np.split(found, (3 * count, 6 * count), axis=1)
+    maps = transitions(early, late, h).reshape(3, 3, count, *found.shape[2:]).swapaxes(0, 2)
+    times, ends = knots.tolist(), ends.swapaxes(0, 1)
+    return [(times[k], times[k + 1], maps[k], ends[k : k + 2]) for k in range(count)]
 
 
-def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
+def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Array, Array]:
     """Integrate P backwards from the last knot, and return the times and the values of P.
 
-    `at` returns the coefficients (k, nx, nx) at times (k,). If P changes too fast, raise
+    `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast, raise
     `LinAlgError`.
     """
     times, values = [float(knots[-1])], [P]
@@ -139,15 +116,15 @@ def solve_back(at: Callable[[Array], Coefficients], knots: Array, P: Array) -> t
         # Intervals still to be integrated; the latest interval is the last entry.
         pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
-            start, end, whole, early, late, at_start, at_end = pending.pop()
+            start, end, (whole, early, late), (at_start, at_end) = pending.pop()
             P, middle, error = values[-1], 0.5 * (start + end), math.inf
             # A long step may fail because its coefficients are indefinite. Shorter steps are then
             # tried.
             with suppress(np.linalg.LinAlgError):
-                single, half = whole.back(P), late.back(P)
-                double = early.back(half)
+                single, half = stepped_back(whole, P), stepped_back(late, P)
+                double = stepped_back(early, half)
                 # `between` is the value of the Hermite cubic at the middle of the interval.
-                bend = at_start.rate(double) - at_end.rate(P)
+                bend = rate(at_start, double) - rate(at_end, P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
                 # The method has fourth order, so the error of two half steps is a fifteenth of
                 # their difference from one whole step. To be safe, a quarter is assumed.

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Indices, Mask
+from fflin.base.validation import Array, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 
 # A plan is accepted if the sum of its violations [rad, m, s] of goal and limits is at most this.
@@ -141,7 +142,7 @@ class Search(NamedTuple):
         to_end = shooting.between((q[-1], v[-1]), self.end)
         knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
         tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
-        inside = tighter[:, None, None] - shooting.inside(motions, self.parts)
+        inside = tighter[:, None, None] - shooting.inside(motions, self.parts)[:, :-1]
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
@@ -167,19 +168,26 @@ class Search(NamedTuple):
             ends, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
         except InputError:  # the motion has diverged
             return None
+        # The soft limits of states at knots, and of states within intervals, which depend on
+        # (x[k], u[k], u[k + 1]).
+        nw, (knot, limit) = nx + u.shape[1], np.nonzero(np.isfinite(trial.knots).any(axis=0))
+        at_knots = sp.eye_array(len(u) * nw, format="csr")[knot * nw + limit]
         k, part, state = np.nonzero(limited)
-        rows = StageRows(k, inside[k, part, state], trial.inside[:, k, part, state], _PRICE)
-        limits = np.concatenate((trial.knots, self.limits[:, None] - u), axis=2)
-        weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
-        H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
-        g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
+        columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
+        starts = np.arange(len(k) + 1) * columns.shape[1]
+        entries = inside[k, part, state].ravel(), columns.ravel(), starts
+        rows = sp.vstack((at_knots, sp.csr_array(entries, (len(k), len(u) * nw))))
+        room = np.hstack((trial.knots[:, knot, limit], trial.inside[:, k, part, state]))
+        prices, of_x = np.full(room.shape[1], _PRICE), np.zeros((len(u), nx))
+        cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
-        found = solve_stages(ends, trial.missed, H, g, limits, soft, rows, scale)
+        limits = self.limits[:, None] - u
+        found = solve_stages(ends, trial.missed, cost, g, limits, rows, room, prices, scale)
         if found is None:
             return None
         z, du, _ = found
-        at_knots = float(excess(trial.knots - z).sum())
-        return *found, at_knots + float(excess(rows.limits - rows.values(z, du)).sum()), at_knots
+        outside = excess(room - rows @ np.hstack((z, du)).ravel()).sum()
+        return *found, float(outside), float(excess(trial.knots - z).sum())
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals with the smallest changes, if possible.
@@ -236,54 +244,36 @@ def excess(room: Array) -> Array:
 _ACCURACY = 1e-10
 
 
-class StageRows(NamedTuple):
-    """Soft limits on linear combinations of states and inputs.
-
-    The limits are ``low - s <= G (x[k], u[k], u[k + 1]) <= high + s`` with a slack ``s >= 0``.
-    """
-
-    k: Indices  # (m,)
-    G: Array  # (m, nx + 2 nu)
-    limits: Array  # low and high (2, m)
-    soft: float  # cost of a unit of s
-
-    def values(self, x: Array, u: Array) -> Array:
-        """Return G (x[k], u[k], u[k + 1]) (m,)."""
-        stages = np.hstack((x[self.k], u[self.k], u[self.k + 1]))
-        values: Array = np.einsum("ij,ij->i", self.G, stages)
-        return values
-
-
 def solve_stages(
     ends: Array,
     c: Array,
-    H: Array,
+    cost: Array,
     g: Array,
     limits: Array,
-    soft: Array,
-    rows: StageRows,
+    rows: sp.csr_array,
+    room: Array,
+    prices: Array,
     scale: Array,
 ) -> tuple[Array, Array, Array] | None:
-    r"""Solve a quadratic program over N stages for w = (x, u), with bounds on every variable.
+    r"""Solve a quadratic program over N stages for w = (x, u), with hard and soft limits.
 
     .. math::
-        \min \sum_{k=0}^N \tfrac12 w_k^T H_k w_k + g_k^T w_k + \mathrm{soft}_k^T s_k, \quad
+        \min \sum_{k=0}^N \tfrac12 w_k^T \operatorname{diag}(\mathrm{cost}_k)\,w_k + g_k^T w_k
+        + \mathrm{prices}^T s, \quad
         x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad x_0 = 0, \quad
-        \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0
+        \mathrm{low}_k \le u_k \le \mathrm{high}_k, \quad
+        \mathrm{room}_0 - s \le \mathrm{rows}\,w \le \mathrm{room}_1 + s, \quad s \ge 0
 
-    The soft limits of `rows` are further constraints. `scale` (nx + nu,) contains typical sizes of
-    the variables, by which the program is scaled. `ends` (N, nx, nx + 2 nu) contains A, B and D
-    side by side; D is zero if inputs are held. `H` (N + 1, nx + nu, nx + nu) is positive
-    semidefinite. `limits` (2, N + 1, nx + nu) contains low and high. g and soft have one row for
-    each knot; a bound with an infinite entry of soft is hard.
+    `ends` (N, nx, nx + 2 nu) contains A, B and D side by side; D is zero if inputs are held. cost
+    and g have one row for each knot; no entry of cost is negative. `limits` (2, N + 1, nu) contains
+    low and high. `rows` has a column for each entry of w. `scale` (nx + nu,) contains typical sizes
+    of the variables, by which the program is scaled.
 
     Returns x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
     Returns None if the program is infeasible or the solver fails.
     """
-    import scipy.sparse as sp
-
     piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
-    (N, nx, _), (knots, nw) = ends.shape, g.shape
+    (N, nx, _), (knots, nw), m = ends.shape, g.shape, len(prices)
     size, of_rows = np.tile(scale, knots), 1.0 / np.tile(scale[:nx], knots)
     none = sp.csc_array((N * nx, nw))
     after = np.concatenate((np.tile(-np.eye(nx), (N, 1, 1)), ends[:, :, nw:]), axis=2)
@@ -291,45 +281,31 @@ def solve_stages(
     links = links + sp.hstack((none, sp.block_diag(after)))
     first = sp.eye_array(nx, knots * nw)
     E = sp.diags_array(of_rows) @ sp.vstack((first, links)) @ sp.diags_array(size)
-    H = scale[:, None] * H * scale
-    cost = np.abs(H).max() or 1.0
-    low, high = limits.reshape(2, -1) / size
-    prices = soft.ravel() * size
-    at = np.flatnonzero(np.isfinite(prices) & (np.isfinite(low) | np.isfinite(high)))
-    picked = sp.eye_array(knots * nw, format="csr")[at]
-    columns = rows.k[:, None] * nw + np.append(np.arange(nw), nx + np.arange(nw, 2 * nw - nx))
-    combined = sp.csr_array(
-        (
-            rows.G.ravel() * size[columns.ravel()],
-            columns.ravel(),
-            np.arange(len(columns) + 1) * rows.G.shape[1],
-        ),
-        (len(columns), knots * nw),
-    )
-    # Each soft limit has a slack s, with w + s >= low and w - s <= high.
-    limited = sp.vstack((picked, combined))
-    least, largest = np.hstack(((low[at], high[at]), rows.limits))
-    prices = np.concatenate((prices[at], np.full(len(columns), rows.soft)))
-    low[at], high[at] = -np.inf, np.inf
-    k, open_ = len(least), np.full(len(least), np.inf)
-    slack = sp.eye_array(k)
-    G = sp.vstack((sp.hstack((limited, slack)), sp.hstack((limited, -slack))), format="csc")
-    of_G = np.concatenate((least, -open_)), np.concatenate((open_, largest))
+    # Whole blocks are stored, because PIQP would otherwise make rounding errors in inputs of 0.
+    H = (cost * scale**2)[:, :, None] * np.eye(nw)
+    unit = H.max() or 1.0
+    bounds = np.full((2, knots, nw), [[[-np.inf]], [[np.inf]]])
+    bounds[:, :, nx:] = limits / scale[nx:]
+    low, high = bounds.reshape(2, -1)
+    # Each soft limit has a slack s, with rows w + s >= low and rows w - s <= high.
+    soft, slack, open_ = rows @ sp.diags_array(size), sp.eye_array(m), np.full(m, np.inf)
+    G = sp.vstack((sp.hstack((soft, slack)), sp.hstack((soft, -slack))), format="csc")
+    of_G = np.append(room[0], -open_), np.append(open_, room[1])
     solver = piqp.SparseSolver()
     for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
         setattr(solver.settings, name, _ACCURACY)
     solver.setup(
-        sp.block_diag((*(H / cost), sp.csc_array((k, k))), format="csc"),
-        np.concatenate((g.ravel() * size, prices)) / cost,
-        sp.hstack((E, sp.csc_array((E.shape[0], k))), format="csc"),
+        sp.block_diag((*(H / unit), sp.csc_array((m, m))), format="csc"),
+        np.append(g.ravel() * size, prices) / unit,
+        sp.hstack((E, sp.csc_array((E.shape[0], m))), format="csc"),
         of_rows * np.append(np.zeros(nx), -c),
-        *((G, *of_G) if k else (None, None, None)),
-        np.concatenate((low, np.zeros(k))),
-        np.concatenate((high, open_)),
+        *((G, *of_G) if m else (None, None, None)),
+        np.append(low, np.zeros(m)),
+        np.append(high, open_),
     )
     if solver.solve() != piqp.PIQP_SOLVED:
         return None
     found = solver.result
     w = (found.x[: len(size)] * size).reshape(knots, nw)
-    y = (cost * of_rows * found.y).reshape(knots, nx)[1:]
-    return w[:, :nx], np.clip(w, *limits)[:, nx:], y
+    y = (unit * of_rows * found.y).reshape(knots, nx)[1:]
+    return w[:, :nx], np.clip(w[:, nx:], *limits), y

@@ -1,7 +1,5 @@
 """Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pinocchio as pin
 
@@ -17,7 +15,8 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Least number of steps per interval in a trial, because limits also apply within the intervals.
+# Least number of steps per interval in a trial, because limits also apply within the intervals, at
+# the ends of up to as many equal parts. All numbers of steps are powers of 2.
 _STEPS = 16
 
 # Jacobians are integrated with a quarter of the steps of the motion, but with at most this number.
@@ -25,13 +24,9 @@ _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
-
-class Motions(NamedTuple):
-    """Motions of N intervals from the knots, with a row for the start and for each step."""
-
-    q: Array  # (N, steps + 1, nq)
-    v: Array  # (N, steps + 1, nv)
-    rates: Array  # dv/dt (N, steps + 1, nv)
+# Configurations (N, steps + 1, nq) and velocities (N, steps + 1, nv) of the motions of N intervals
+# from the knots, with a row for the start and for each step.
+Motions = tuple[Array, Array]
 
 
 class Shooting:
@@ -74,32 +69,27 @@ class Shooting:
         """
         q, v, first, steps = q[:-1], v[:-1], u[:-1], steps or max(self.steps, _STEPS)
         h, change = self.h[0], 0.0 * first if self.held else np.diff(u, axis=0)
-        method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
-        configurations, speeds, rates = [q], [v], list[Array]()
+        method, points = CommutatorFree4(self.state.robot.model, h / steps, len(q)), [(q, v)]
 
         def rate(t: float, q: Array, v: Array) -> Array:
-            rates.append(self._aba.accelerations(q, v, first + t / h * change))
-            return rates[-1]
+            return self._aba.accelerations(q, v, first + t / h * change)
 
         for step in range(steps):
-            q, v = method.step(rate, step * method.dt, q, v)
-            configurations.append(q)
-            speeds.append(v)
-        rate(h, q, v)
-        found = configurations, speeds, rates[:: len(method.nodes)]
-        return Motions(*(np.array(each).swapaxes(0, 1) for each in found))
+            points.append(method.step(rate, step * method.dt, *points[-1]))
+        configurations, speeds = zip(*points, strict=True)
+        return np.stack(configurations, axis=1), np.stack(speeds, axis=1)
 
     def missed(self, q: Array, v: Array, motions: Motions) -> Array:
         """Return the gaps (N, nx) between the ends of the intervals and the next knots."""
-        rows = zip(q[1:], v[1:], motions.q[:, -1], motions.v[:, -1], strict=True)
-        return np.array([self.between(row[:2], row[2:]) for row in rows])
+        knots, ends = zip(q[1:], v[1:], strict=True), zip(*(x[:, -1] for x in motions), strict=True)
+        return np.array([self.between(*pair) for pair in zip(knots, ends, strict=True)])
 
     def flown(self, start: Point, u: Array) -> Point:
         """Integrate the motion from a point under the inputs u, and return its knots."""
         q, v = (np.tile(each, (len(u), 1)) for each in start)
         for k in range(len(u) - 1):
             found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
-            q[k + 1], v[k + 1] = found.q[0, -1], found.v[0, -1]
+            q[k + 1], v[k + 1] = found[0][0, -1], found[1][0, -1]
         return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
@@ -114,20 +104,9 @@ class Shooting:
         return values
 
     def inside(self, motions: Motions, parts: int) -> Array:
-        """Return limited values (N, parts - 1, nx) where each interval is divided into parts."""
-        # Within a step, the rates are Hermite cubics of time. The positions are their integrals.
-        n, steps = self.state.robot.n, motions.q.shape[1] - 1
-        at = np.arange(1, parts) * steps / parts
-        step = at.astype(int)
-        s, h = (at - step)[:, None], self.h[0] / steps
-        rates, changes = (self.state.velocities(x)[..., 6:] for x in (motions.v, motions.rates))
-        ends = (x[:, k] for x in (rates, h * changes) for k in (step, step + 1))
-        first, rate, late, bend = cubic(*ends).swapaxes(0, 1)
-        values = self.limited_values(motions.q[:, step], motions.v[:, step])
-        average = first + s * (rate / 2.0 + s * (late / 3.0 + s * bend / 4.0))
-        values[..., 6 : 6 + n] += h * s * average
-        values[..., values.shape[-1] - n :] = first + s * (rate + s * (late + s * bend))
-        return values
+        """Return limited values (N, parts, nx) at the ends of equal parts of each interval."""
+        every = (motions[0].shape[1] - 1) // parts
+        return self.limited_values(*(each[:, every::every] for each in motions))
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
         """Find the number of steps for which interval ends have this accuracy [rad, m, s]."""
@@ -152,7 +131,7 @@ class Shooting:
         motions = self.motions(q, v, u, 4 * steps)
         late = np.arange(2 * steps + 1) / (2.0 * steps)
         late = np.zeros_like(late) if self.held else late
-        q, v = (each[:, ::2] for each in motions[:2])
+        q, v = (each[:, ::2] for each in motions)
         inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
         points = (each.reshape(-1, each.shape[-1]) for each in (q, v, inputs))
         models = self._linearizer.along(*points)

@@ -20,14 +20,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import stands_for_any
 from fflin.base.validation import Array, frozen
-from fflin.robot.equipment.appendages import (
-    Appendage,
-    FlexibleAppendage,
-    Slosh,
-    rigid_inertia,
-)
-from fflin.robot.fields import checked_inputs
-from fflin.robot.inputs import Input, ReactionWheel, named_wheels
+from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.inputs import Input, ReactionWheel, checked_inputs, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import LinkMass, as_inertia
 from fflin.robot.urdf.description import is_impossible
@@ -79,18 +73,19 @@ def equipped(
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
     parts = _mounted_wheels(model, bodies, checked)
     items = robot.appendages if appendages is None else tuple(appendages)
-    parts += _mounted_modes(bare, bodies, items)
+    parts += _mounted_modes(model, bodies, items)
     if parts:
+        new = [part.joint for part in parts]
         taken = [*{*model.names, *(frame.name for frame in model.frames.tolist())}]
-        taken += [part.name for part in parts]
-        for part in parts:
-            if taken.count(part.name) > 1:
+        taken += [joint.name for joint in new]
+        for name in taken[-len(new) :]:
+            if taken.count(name) > 1:
                 raise InputError(
-                    f"'{part.name}' has the name of another joint, frame, wheel or mode of the "
-                    "robot; give the wheel or the appendage another name"
+                    f"'{name}' has the name of another joint, frame, wheel or mode of the robot; "
+                    "give the wheel or the appendage another name"
                 )
         model = _with_mounted(model, bodies, parts)
-        placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
+        placed = [joint.within(model) for joint in (*joints, *new)]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
@@ -133,19 +128,23 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
         raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
     bare, taken = robot._bare, set[int]()
     for item in given:
-        if not isinstance(item, FlexibleAppendage) or not item.rigid or item.inertia is None:
+        if not isinstance(item, FlexibleAppendage) or item.inertia is None:
             continue
+        # The link at the frame, or the whole body if the frame is not a link.
         joint, placement = find_frame(bare.model, item.frame)
+        body, what = bare.model.inertias[joint], f"the body with frame '{item.frame}'"
+        of_file, own, links = rigid_inertia(item.inertia), body, bare.links
+        if item.frame in bare.pieces:
+            own, what = as_inertia(bare.pieces[item.frame]), f"link '{item.frame}'"
+        if not item.rigid:
+            _compare_inertia(item, item.inertia, own.se3Action(placement.inverse()), what)
+            continue
         if joint in taken:
             raise InputError(
                 f"'{item.title}' is the second appendage with rigid=True on its body; use "
                 "rigid=True for only one appendage of each body"
             )
         taken.add(joint)
-        # The inertia from the appendage's file replaces the inertia of the link. It replaces the
-        # whole body if the frame is not a link.
-        of_file, body, links = rigid_inertia(item.inertia), bare.model.inertias[joint], bare.links
-        own = as_inertia(bare.pieces[item.frame]) if item.frame in bare.pieces else body
         if item.frame in links:
             at_center = pin.SE3(np.eye(3), of_file.lever)
             links = {**links, item.frame: LinkMass(of_file.mass, of_file.inertia, at_center)}
@@ -173,11 +172,6 @@ class Mounted(NamedTuple):
     inertia: pin.Inertia
     armature: float = 0.0
 
-    @property
-    def name(self) -> str:
-        """Name of the joint."""
-        return self.joint.name
-
 
 def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
     """Return a model with a new joint for each part; `bodies` replace the old inertias.
@@ -191,7 +185,7 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
         if not new.existFrame(on, pin.FrameType.JOINT):
             new.addJointFrame(new.getJointId(on))
         alone = pin.Model()
-        alone.addJoint(0, part.motion, pin.SE3.Identity(), part.name)
+        alone.addJoint(0, part.motion, pin.SE3.Identity(), part.joint.name)
         alone.addJointFrame(1)
         new = pin.appendModel(new, alone, new.getFrameId(on, pin.FrameType.JOINT), part.placement)
     restore_names(new, names)
@@ -200,7 +194,7 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
         new.inertias[new.getJointId(name)] = body
     new.name, new.gravity, armature = model.name, model.gravity, new.armature.copy()
     for part in parts:
-        index = new.getJointId(part.name)
+        index = new.getJointId(part.joint.name)
         new.inertias[index], armature[new.idx_vs[index]] = part.inertia, part.armature
     new.armature = armature
     return new
@@ -306,15 +300,14 @@ def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
 
 
 def _mounted_modes(
-    bare: Robot, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
+    model: pin.Model, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
     """Return mounted bodies for all modes, and subtract them from the bodies that carry them."""
-    model, parts = bare.model, list[Mounted]()
+    parts = list[Mounted]()
     of_body: dict[int, list[tuple[Appendage, pin.SE3, Array]]] = {}
     for item in appendages:
         joint, placement, L = _carried(model, item)
         of_body.setdefault(joint, []).append((item, placement, L))
-        _compare_inertia(item, placement, bodies[joint], bare)
     for joint, items in of_body.items():
         body, L = bodies[joint], np.hstack([L for _, _, L in items])
         rows = np.array([body.mass]), body.lever[None], body.inertia[None]
@@ -328,26 +321,24 @@ def _mounted_modes(
                     f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the "
                     "inertia in the URDF must include the appendage as if it were rigid"
                 )
-        for item, placement, _ in items:
+        columns = list[tuple[str, Array, Array]]()
+        for item, placement, L in items:
             if isinstance(item, Slosh):
                 at = placement * np.array(item.position)
                 bodies[joint] = bodies[joint] - pin.Inertia(item.mass, at, np.zeros((3, 3)))
                 parts += _liquid(item, joint, placement)
-        columns = [
-            (name, column, placement.translation)
-            for item, placement, L in items
-            if isinstance(item, FlexibleAppendage)
-            for name, column in zip(item.modes, L.T, strict=True)
-        ]
-        body, lighter = bodies[joint], 1.0
+            else:
+                origins = [placement.translation] * len(item.modes)
+                columns += zip(item.modes, L.T, origins, strict=True)
+        body = bodies[joint]
         balls = [_ball(joint, body, *column) for column in columns]
-        if mass := sum(ball.inertia.mass for ball in balls):
-            lighter = _LARGEST_SHARE * body.mass / mass
+        mass = sum(ball.inertia.mass for ball in balls)
+        lighter = _LARGEST_SHARE * body.mass / mass if mass else 1.0
         if lighter < _LIGHTEST:
             raise InputError(
-                f"mode '{balls[0].name}' moves the centre of mass of its body, but without the "
-                f"sloshing liquid this body has only {body.mass:.3g} kg; the mass in the URDF must "
-                "include the appendage and the liquid"
+                f"mode '{balls[0].joint.name}' moves the centre of mass of its body, but without "
+                f"the sloshing liquid this body has only {body.mass:.3g} kg; the mass in the URDF "
+                "must include the appendage and the liquid"
             )
         if lighter < 1.0:
             balls = [_ball(joint, body, *column, lighter) for column in columns]
@@ -375,22 +366,16 @@ def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[
 
 
 def _compare_inertia(
-    appendage: Appendage, placement: pin.SE3, body: pin.Inertia, bare: Robot
+    appendage: FlexibleAppendage, inertia: Array, of_urdf: pin.Inertia, what: str
 ) -> None:
-    """Warn if the rigid inertia in an appendage's file differs from the inertia of the link."""
-    if not isinstance(appendage, FlexibleAppendage) or appendage.inertia is None:
-        return
-    what = f"the body with frame '{appendage.frame}'"
-    if (link := bare.pieces.get(appendage.frame)) is not None:
-        body, what = as_inertia(link), f"link '{appendage.frame}'"
-    of_file, of_link = rigid_inertia(appendage.inertia), body.se3Action(placement.inverse())
-    M = of_link.matrix()
-    scale = np.array([1.0, 1.0, 1.0, *[1.0 / _radius_of_gyration(of_link)] * 3])
-    apart = np.abs(M - appendage.inertia) * np.outer(scale, scale)
-    if apart.max() > _AGREE * max(M[0, 0], of_file.mass):
+    """Warn if the rigid inertia in an appendage's file differs from the inertia in the URDF."""
+    scale = np.array([1.0, 1.0, 1.0, *[1.0 / _radius_of_gyration(of_urdf)] * 3])
+    apart = np.abs(of_urdf.matrix() - inertia) * np.outer(scale, scale)
+    of_file = rigid_inertia(inertia)
+    if apart.max() > _AGREE * max(of_urdf.mass, of_file.mass):
         file, urdf = (
             f"{x.mass:.4g} kg at ({', '.join(f'{r:.4g}' for r in x.lever)}) m"
-            for x in (of_file, of_link)
+            for x in (of_file, of_urdf)
         )
         warnings.warn(
             f"flexible appendage '{appendage.title}': the inertia in its file ({file}) differs "
@@ -398,7 +383,7 @@ def _compare_inertia(
             "the moments of inertia; correct the URDF, or use the inertia of the file with "
             "rigid=True",
             FflinWarning,
-            stacklevel=6,
+            stacklevel=5,
         )
 
 
@@ -430,17 +415,13 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
     return least
 
 
-def first_impossible(
-    model: pin.Model,
-    appendages: Sequence[Appendage],
-    bodies: Mapping[int, tuple[Array, Array, Array]],
-) -> int | None:
+def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]) -> int | None:
     """Return the index of the first row in which modes need more inertia than their body has.
 
-    `bodies` maps joints of `model` to masses (N,), centres of mass (N, 3) and inertias (N, 3, 3).
-    The result is None if all N rows are possible.
+    `bodies` maps joints of the robot without wheels and modes to masses (N,), centres of mass
+    (N, 3) and inertias (N, 3, 3). The result is None if all N rows are possible.
     """
-    found = [_carried(model, item) for item in appendages]
+    found = [_carried(robot._bare.model, item) for item in robot.appendages]
     impossible = []
     for joint, rows in bodies.items():
         if of_body := [L for carrier, _, L in found if carrier == joint]:

@@ -3,7 +3,7 @@
 import hashlib
 import sys
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
@@ -13,18 +13,9 @@ import pinocchio as pin
 
 from fflin.base.errors import MissingPackageError, UrdfError
 from fflin.base.process import import_path_without
-from fflin.base.writing import read_file, remember
-from fflin.robot.urdf.description import (
-    INERTIA,
-    UNLIMITED,
-    JointElement,
-    Link,
-    Mimic,
-    Pose,
-    inertia_notes,
-    read_tree,
-    resolve_mimics,
-)
+from fflin.base.writing import remember
+from fflin.robot.urdf import description
+from fflin.robot.urdf.description import INERTIA, UNLIMITED, JointElement, Link, Mimic, Pose
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 SIZE_LIMIT = 64 * 2**20  # bytes
@@ -64,28 +55,23 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # warnings, one line each
 
 
-def read_urdf(path: Path) -> Urdf:
-    """Read a URDF or xacro file as a free-flying robot."""
-    return describe(read_file(path, "URDF", SIZE_LIMIT), path)
-
-
 def describe(document: bytes, path: Path) -> Urdf:
     """Read a URDF from the bytes of a file; `path` is its name in errors."""
     root, notes = plain_root(document, path)
-    links, joints = read_tree(root)
-    mimics = resolve_mimics(joints)
-    # A continuous joint does not count full turns. A leader must count them if its full turn
-    # displaces a mimic joint.
-    counted = {
-        mimic.leader
-        for name, mimic in mimics.items()
-        if joints[name].type != "continuous" or not mimic.multiplier.is_integer()
-    }
+    links, joints = description.read_tree(root)
+    mimics = description.resolve_mimics(joints)
+    # A continuous joint does not count full turns, but a revolute joint does. A leader must count
+    # them if its full turn displaces a mimic joint.
+    for name, (leader, multiplier, _) in mimics.items():
+        turning = joints[leader].type == "continuous"
+        if turning and not (joints[name].type == "continuous" and multiplier.is_integer()):
+            limits = (joints[leader].limits or {}) | _UNBOUNDED
+            joints[leader] = joints[leader]._replace(type="revolute", limits=limits)
     root_joint = "root_joint"
     while root_joint in joints or root_joint in links:
         root_joint += "_"
     name = root.attributes.get("name", "").strip()
-    clean = write_urdf(name, links, joints, counted)
+    clean = write_urdf(name, links, joints)
     try:
         with ThreadPoolExecutor(1) as other:
             usual = threading.stack_size(_STACK)
@@ -110,7 +96,7 @@ def describe(document: bytes, path: Path) -> Urdf:
     model.gravity.setZero()
     # File names may contain bytes that are not valid text.
     model.name = name or path.stem.encode(errors="backslashreplace").decode()
-    notes += [*notes_of(root), *inertia_notes(links.values(), model, path.stem)]
+    notes += [*notes_of(root), *description.inertia_notes(links.values(), model, path.stem)]
     meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
     digest = hashlib.sha256(document).hexdigest()
     return Urdf(model, digest, links, joints, mimics, meshes, tuple(notes))
@@ -121,18 +107,20 @@ def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
     root = parse(document, str(path))
     # Search first for text that may indicate xacro, or for "&#", which may encode such text.
     text = document.replace(b"\0", b"")  # so that UTF-16 is searched too
-    first = None
-    if any(x in text for x in (b"xacro:", b"$", b"&#")):
-        for element in chain([root], root.iterate(_IGNORED)):
-            marked = any("${" in x or "$(" in x for x in element.attributes.values())
-            # A declaration of the prefix xacro is an attribute, and does not use xacro.
-            if marked or element.tag.startswith("xacro:"):
-                first = element
-                break
+    suspect = any(x in text for x in (b"xacro:", b"$", b"&#"))
+    elements = chain([root], root.iterate(_IGNORED)) if suspect else ()
+    first = next(filter(_uses_xacro, elements), None)
     if path.suffix != ".xacro" and not first:
         return root, []
     expanded, notes = _expand(path, document, first)
     return parse(expanded, f"{path} as expanded by xacro"), notes
+
+
+def _uses_xacro(element: Element) -> bool:
+    # A declaration of the prefix xacro is an attribute, and does not use xacro.
+    return element.tag.startswith("xacro:") or any(
+        "${" in value or "$(" in value for value in element.attributes.values()
+    )
 
 
 def ignored(
@@ -157,16 +145,8 @@ def ignored(
             yield "passive", names, said
 
 
-def write_urdf(
-    name: str,
-    links: Mapping[str, Link],
-    joints: Mapping[str, JointElement],
-    counted: Collection[str],
-) -> str:
-    """Return a URDF of links and joints, with numbers in full precision.
-
-    Continuous joints in `counted` become revolute joints, because these count full turns.
-    """
+def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]) -> str:
+    """Return a URDF of links and joints, with numbers in full precision."""
     parts = []
     for link in links.values():
         inertial = ""
@@ -177,8 +157,6 @@ def write_urdf(
         parts.append(_tag("link", {"name": link.name}, inertial))
     for joint in joints.values():
         kind, limits = joint.type, _UNBOUNDED if joint.limits is None else joint.limits
-        if kind == "continuous" and joint.name in counted:
-            kind, limits = "revolute", limits | _UNBOUNDED
         inside = _tag("parent", {"link": joint.parent}) + _tag("child", {"link": joint.child})
         inside += _origin(joint.origin) + _tag("axis", {"xyz": joint.axis})
         inside += _tag("dynamics", {"damping": joint.damping, "friction": joint.friction})
@@ -190,9 +168,8 @@ def write_urdf(
 
 
 def _origin(pose: Pose) -> str:
-    if pose.quaternion is None:
-        return _tag("origin", {"xyz": pose.xyz, "rpy": pose.rpy})
-    return _tag("origin", {"xyz": pose.xyz, "quat_xyzw": pose.quaternion})
+    turned = {"quat_xyzw": pose.quaternion} if pose.quaternion else {"rpy": pose.rpy}
+    return _tag("origin", {"xyz": pose.xyz} | turned)
 
 
 def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:

@@ -13,7 +13,7 @@ import pytest
 import fflin
 from fflin.robot.urdf import reader as expansion
 from fflin.robot.urdf.description import Mimic
-from fflin.robot.urdf.reader import describe, ignored, read_urdf
+from fflin.robot.urdf.reader import describe, ignored
 from fflin.robot.urdf.xml import parse
 from tests.support.messages import says
 from tests.support.reader_corpus import (
@@ -237,7 +237,7 @@ def test_blanks_at_the_end_of_a_name_are_seen():
 def test_hash_is_of_the_file(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_bytes(arm().replace("\n", "\r\n").encode())
-    assert read_urdf(path).sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert fflin.load(path).urdf_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_load_warns_and_keeps_the_notes(tmp_path):
@@ -322,7 +322,7 @@ def test_xacro_includes_from_its_own_folder(tmp_path):
     include = '<xacro:include filename="parts/arm.xacro"/>'
     for _ in range(2):  # nothing of the first expansion is left over
         path.write_text(arm(child=include, attributes=f'name="r" {namespace}'))
-        assert read_urdf(path).model.inertias[2].mass == 3.0
+        assert describe(path.read_bytes(), path).model.inertias[2].mass == 3.0
 
 
 def test_lines_of_elements():

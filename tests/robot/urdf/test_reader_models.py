@@ -12,7 +12,7 @@ from example_robot_data.robots_loader import getModelPath
 
 import fflin
 from fflin.base.errors import FflinError
-from fflin.robot.urdf.reader import read_urdf
+from fflin.robot.urdf.reader import describe
 from tests.support.patience import finished
 
 BUNDLED = Path(__file__).parents[3] / "robots"
@@ -69,7 +69,7 @@ def test_all_files_are_there():
 )
 def test_same_model_as_pinocchio(path):
     expected = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
-    model = read_urdf(path).model
+    model = describe(path.read_bytes(), path).model
     assert_same(model, expected)
     assert not model.gravity.vector.any()
 
@@ -78,7 +78,7 @@ def test_same_model_as_pinocchio(path):
 def test_refused_with_a_reason(name):
     path = next(p for p in FILES if p.name == name)
     with pytest.raises(fflin.UrdfError, match=rf"{name}:\d+: .*{re.escape(REFUSED[name])}"):
-        read_urdf(path)
+        describe(path.read_bytes(), path)
 
 
 CHAIN = """

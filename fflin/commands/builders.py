@@ -1,0 +1,471 @@
+"""Functions that build the robot, operating point, linear models and closed loop of a command."""
+
+from __future__ import annotations
+
+import warnings
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import fflin
+from fflin.base.errors import FflinWarning, InputError, UnknownNameError, located
+from fflin.base.names import joints_by_name, rates_by_name
+from fflin.commands import DONE
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from fflin.base.validation import Array
+    from fflin.dynamics.state import Frame
+
+T = TypeVar("T")
+
+_WEIGHTS = ("weights", "q", "r", "bryson", "sample")
+_POSE = ("target_rpy", "target_position")
+_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
+
+_FILES, SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Report of a command.
+
+    Attributes
+    ----------
+    robot : str or None
+        Name of the robot.
+    result : object
+        Result of the library, or a mapping; --json prints its fields.
+    text : str
+        Report without --json. Its first paragraph is the entry "result" of --json.
+    files : mapping
+        {path: function that writes the file, or None if the file is already written}. An entry with
+        the path None is ignored.
+    code : int
+        Exit code.
+    interrupted : str
+        Reason of an interruption, or "". Existing files are not replaced after an interruption.
+    """
+
+    robot: str | None
+    result: object
+    text: str
+    files: Mapping[Path | None, Callable[[Path], object] | None] = field(default_factory=dict)
+    code: int = DONE
+    interrupted: str = ""
+
+
+def load_robot(arguments: Namespace) -> fflin.Robot:
+    """Load the robot, and apply the options that override its settings."""
+    given = {
+        name: value
+        for name in ("passive", "gravity", "orbit", "stiffness", "damping")
+        if (value := getattr(arguments, name, None))
+    }
+    # Give these settings to `load`, because its warnings depend on them.
+    first = {"passive": given.pop("passive")} if "passive" in given else {}
+    if given.get("damping") == [(None, "urdf")]:
+        first["damping"] = "urdf"
+    robot = fflin.load(arguments.robot, lock=once("--lock", arguments.lock), **first)
+    for name in [each for each in ("stiffness", "damping") if each in given]:
+        for_all = [value for joint, value in given[name] if joint is None]
+        if for_all and len(given[name]) > 1:
+            raise InputError(
+                f"--{name} is given for all joints and for single joints; give only one of them"
+            )
+        given[name] = for_all[0] if for_all else once(f"--{name}", given[name])
+    inputs = getattr(arguments, "inputs", None)
+    if inputs == "joints" and not robot.n:
+        raise InputError(f"--inputs joints: '{robot.name}' has no joints")
+    if inputs is not None:
+        bundled = {
+            "joints": (fflin.JointTorque("*"),),
+            "base": (fflin.BaseTorque(), fflin.BaseForce()),
+        }
+        found = bundled.get(inputs) or fflin.load_inputs(inputs)
+        with located(inputs):  # a name or an inertia that this robot does not accept
+            robot = robot.replace(inputs=found)
+    if outputs := getattr(arguments, "output", None):
+        given["outputs"] = outputs
+    return robot.merged(given)
+
+
+def limits_of_options(
+    arguments: Namespace,
+) -> list[str | dict[str, float]] | dict[str, float] | None:
+    """Return the limits that the options --limits and --limit define."""
+    given = once("--limit", arguments.limit)
+    return ["urdf", given] if arguments.limits == "urdf" else given or None
+
+
+def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
+    """Raise an error if any option in `names` is given; `why` explains why it has no effect."""
+    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
+        raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
+
+
+def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
+    """Return the values of a repeatable option by name; raise an error if a name is given twice."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        double = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{option} is given more than once for '{double}'; give it once")
+    return values
+
+
+def state_of(
+    robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
+) -> tuple[Array, Array | None]:
+    """Combine states of a robot and the options of a command; return q (nq,) and v (nv,).
+
+    Later states override earlier states, and options override all states.
+
+    The options are --joint, --rpy, --position and --velocity. Their names may have a prefix, such
+    as ``target_``. A joint outside its limits causes a warning.
+    """
+    from fflin.dynamics.points import base_of, combined
+    from fflin.robot.fields import travel_of
+
+    given = {
+        name: value
+        for name in ("rpy", "position", "joint", "velocity")
+        if (value := getattr(arguments, f"{prefix}{name}", None)) is not None
+    }
+    option, names = f"--{prefix}".replace("_", "-"), robot.joint_names
+    values = once(f"{option}joint", given.pop("joint"))
+    rates = once(f"{option}velocity", given.pop("velocity", []))
+    fflin.velocity(robot, rates)  # raises an error if it is invalid
+    given["joints"] = joints_by_name("joint", values, names, robot.joint)
+    given["velocity"] = rates_by_name(names, rates)
+    state = reduce(combined, (*states, given))
+    q = fflin.configuration(robot, state["joints"], base_of(state))
+    for joint in robot.joints:
+        low, high = travel_of(robot.model, joint)
+        value, unit = state["joints"].get(joint.name), joint.unit
+        if value is not None and not low <= value <= high:
+            text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
+            warnings.warn(text, FflinWarning, stacklevel=2)
+    return q, fflin.velocity(robot, state["velocity"]) if state["velocity"] else None
+
+
+def point_of(
+    robot: fflin.Robot, arguments: Namespace, prefix: str = ""
+) -> tuple[Array, Array | None, pin.SE3 | None]:
+    """Return q (nq,), v (nv,) and the reference of the operating point.
+
+    With the prefix ``target_``, return those of the target. With --relative-equilibrium, the base
+    pose is the pose of that equilibrium, which is also the reference.
+    """
+    number = getattr(arguments, "relative_equilibrium", None)
+    if number:
+        names = (f"{prefix}rpy", f"{prefix}position")
+        refuse(arguments, names, "--relative-equilibrium already sets the base pose")
+    states = (robot.point, robot.target) if prefix else (robot.point,)
+    q, v = state_of(robot, arguments, *states, prefix=prefix)
+    if not number:
+        return q, v, reference_of(arguments)
+    q, reference = attitude(robot, q, number, arguments.frame)
+    return q, v, reference
+
+
+def reference_of(arguments: Namespace) -> pin.SE3 | None:
+    """Return the reference from --reference; None is the base pose at the operating point."""
+    import pinocchio as pin
+
+    return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
+
+
+def linear_model(
+    arguments: Namespace, robot: fflin.Robot | None = None
+) -> tuple[fflin.Robot, fflin.LinearModel]:
+    """Return the robot and its linear model about the operating point of the arguments."""
+    robot = robot or load_robot(arguments)
+    return robot, model_about(robot, arguments, *point_of(robot, arguments))
+
+
+def model_about(
+    robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
+) -> fflin.LinearModel:
+    """Linearise about q (nq,) and v (nv,), with inputs from --effort or --equilibrium.
+
+    With --reduce, the model is reduced by its conserved momentum.
+    """
+    axes = {"frame": arguments.frame, "reference": reference}
+    given = once("--effort", arguments.effort)
+    u = fflin.effort(robot, given) if given else None
+    if arguments.relative_equilibrium or arguments.equilibrium:
+        by = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"
+        refuse(arguments, ("effort",), f"{by} already sets the inputs at the operating point")
+        held = fflin.equilibrium(robot, q, v=v, **axes)
+        q, u = held.q, held.u
+    lin = fflin.linearize(robot, q, v, u, **axes)
+    if getattr(arguments, "reduce", False):
+        return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
+    return lin
+
+
+def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
+    """Return q (nq,) and the base placement of the relative equilibrium `number`, from 1 to 24."""
+    import pinocchio as pin
+
+    q = fflin.relative_equilibria(robot, q, frame=frame)[number - 1].q
+    return q, pin.XYZQUATToSE3(q[:7])
+
+
+def models_along(arguments: Namespace, robot: fflin.Robot | None = None) -> fflin.LinearTrajectory:
+    """Return the linear models along the trajectory in the arguments."""
+    point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
+    refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
+    robot = robot or load_robot(arguments)
+    settings = {"hold": arguments.hold, "frame": arguments.frame}
+    motion = fflin.Trajectory.load(arguments.trajectory, robot, **settings)
+    return fflin.linearize_trajectory(robot, motion, strict=arguments.strict)
+
+
+def robot_of_design(
+    robot: fflin.Robot,
+    allocate: bool | None,
+    law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
+) -> fflin.Robot:
+    """Return the robot of a design; for allocation, a base torque and force replace thrusters.
+
+    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base. A
+    given `law` must also command a base torque.
+    """
+    if allocate is None:
+        from fflin.control.authority import thrusters_give_every_wrench
+
+        of_wrench = law is None or "tau_b.x" in law.input_names
+        allocate = of_wrench and thrusters_give_every_wrench(robot)
+    if not allocate:
+        return robot
+    others = tuple(each for each in robot.inputs if not isinstance(each, fflin.Thruster))
+    if len(others) == len(robot.inputs):
+        raise InputError(
+            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
+            "--inputs"
+        )
+    present = {*map(type, others)}
+    missing = [kind() for kind in (fflin.BaseTorque, fflin.BaseForce) if kind not in present]
+    return robot.replace(inputs=(*missing, *others))
+
+
+def designed(
+    arguments: Namespace,
+) -> tuple[fflin.Robot, fflin.Robot, fflin.LinearModel, fflin.Gain]:
+    """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
+    robot = load_robot(arguments)
+    design = robot_of_design(robot, arguments.allocate)
+    _, lin = linear_model(arguments, design)
+    return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+
+
+def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
+    """Return the weights of --q, --r and --bryson, or {} if none of these options is given."""
+    names = ("q", "r", "bryson")
+    given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
+    return given if any(given.values()) else {}
+
+
+def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
+    """Return the regulator of a model with the weights of the options; warn of small margins."""
+    from fflin.control.gain import cautions
+    from fflin.control.lqr import require_fixed_point
+    from fflin.control.weights import rule_weights
+
+    require_fixed_point(lin)
+    if arguments.sample is not None:
+        lin = lin.discretize(arguments.sample)
+    given, speeds = weights_of(arguments), arguments.wheel_speeds
+    try:
+        *QRN, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
+    except UnknownNameError as error:
+        hint = "; --no-allocate weights single thrusters" * allocated
+        raise UnknownNameError(f"{error}{hint}") from None
+    gain = replace(fflin.lqr(lin, *QRN, wheel_speeds=speeds), weights=rule)
+    for text in cautions(gain):
+        warnings.warn(text, FflinWarning, stacklevel=2)
+    return gain
+
+
+def schedule_of(
+    along: fflin.LinearTrajectory, arguments: Namespace, Qf: str | dict[str, float] = "steady"
+) -> fflin.GainSchedule:
+    """Return the time-varying regulator along a trajectory with the weights of the options."""
+    from fflin.control.default_weights import pace_along
+    from fflin.control.tvlqr import steady_end
+    from fflin.control.weights import rule_weights
+
+    sample, lin = arguments.sample, steady_end(along)
+    pace = pace_along(float(along.t[-1] - along.t[0]), sample or 0.0)
+    Q, R, _, rule = rule_weights(lin, arguments.weights, weights_of(arguments), pace=pace)
+    return fflin.tvlqr(along, Q, R, Qf, sample, rule=rule)
+
+
+def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
+    """Return the policy that the arguments define, and keyword arguments of `simulate`."""
+    from fflin.simulation.plan import SHORTEST, time_to_settle
+
+    settings: dict[str, Any] = {
+        **{name: getattr(arguments, name) for name in ("dt", "method", "delay", "duration")},
+        "limits": limits_of_options(arguments),
+    }
+    if not arguments.controller:
+        refuse(arguments, ("negative_feedback",), "only --controller has a sign of the feedback")
+    if arguments.trajectory or arguments.schedule:
+        design = robot_of_design(robot, bool(arguments.allocate))
+        tracking = along(design, arguments)
+        if offset := once("--offset", arguments.offset):
+            settings["q0"], settings["v0"] = tracking.beside(offset)
+        return fflin.Allocation(tracking, design) if arguments.allocate else tracking, settings
+    refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
+    if arguments.free:
+        of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
+        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
+        refuse(arguments, names, "with --free there is no regulator and all inputs are zero")
+        q, v = start_of(robot, arguments)
+        if arguments.duration is None:
+            settings["duration"] = SHORTEST
+        return None, settings | {"q0": q, "v0": v, "frame": arguments.frame}
+    policy, linear, lin = about_point(robot, arguments)
+    q, v = start_of(robot, arguments, linear.lin.reference)
+    if arguments.duration is None:
+        design = policy.design if isinstance(policy, fflin.Allocation) else robot
+        settings["duration"] = time_to_settle(design, linear, q, v)
+    return policy, settings | {"q0": q, "v0": v, "linear": lin}
+
+
+def start_of(
+    robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
+) -> tuple[Array, Array | None]:
+    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
+    point, number = robot.point, arguments.relative_equilibrium
+    if number:  # the start is relative to this pose, which replaces the pose of the point
+        point = {part: point[part] for part in ("joints", "velocity") if part in point}
+    rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
+    q, v = state_of(robot, arguments, point, {"velocity": rates}, robot.start)
+    if number:
+        import pinocchio as pin
+
+        about = reference or attitude(robot, q, number, arguments.frame)[1]
+        q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
+    return q, v
+
+
+def about_point(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
+    """Return the policy about a point, its linear feedback, and the model for the prediction.
+
+    The model is None for MPC, a reduced model, a controller from a file, or allocated thrusters.
+    `simulate` then predicts with the policy's own model, or not at all.
+    """
+    gain: fflin.Gain | None = None
+    feedback: fflin.StateFeedback | fflin.LinearController
+    if arguments.mpc:
+        names = ("allocate", "gain", "controller", "reduce")
+        refuse(arguments, names, "--mpc replaces the regulator and its options")
+        if arguments.sample is None:
+            raise InputError("--mpc needs the sample time of the controller; add --sample H")
+        arguments.allocate = False
+    if arguments.gain:
+        why = "the file of --gain already contains the weights and the operating point"
+        refuse(arguments, (*_WEIGHTS, *_TARGETS), why)
+        gain = fflin.Gain.load(arguments.gain)
+    design = robot_of_design(robot, arguments.allocate, gain)
+    if gain:
+        lin = _about_gain(design, gain, arguments)
+    else:
+        lin = model_about(design, arguments, *point_of(design, arguments, "target_"))
+    if arguments.mpc:
+        from fflin.control.default_weights import Pace
+        from fflin.control.mpc import Mpc
+        from fflin.control.weights import rule_weights
+
+        # Q and R weight a cost integral, because `lin` is in continuous time. Their default values
+        # depend on the sample time.
+        given, pace = weights_of(arguments), Pace(hold=arguments.sample)
+        Q, R, *_ = rule_weights(lin, arguments.weights, given, pace=pace)
+        settings = {"dt": arguments.sample, "limits": limits_of_options(arguments)}
+        by = fflin.mpc(lin, Q, R, horizon=arguments.horizon, **settings)
+        assert isinstance(by, Mpc)  # since the model is about a point
+        return by, fflin.StateFeedback(by.lin, by.gain.K), None
+    if arguments.controller:
+        of_gain = (*_WEIGHTS, "gain", "reduce")
+        refuse(arguments, of_gain, "--controller replaces the regulator and its options")
+        sign = -1.0 if arguments.negative_feedback else 1.0
+        feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
+    else:
+        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
+        feedback = fflin.StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+    if design is not robot:
+        return fflin.Allocation(feedback, design), feedback, None
+    return feedback, feedback, None if arguments.reduce or arguments.controller else lin
+
+
+def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
+    """Return the linear model about the point for which a gain was designed.
+
+    If the base is at the reference of the gain, the target pose of the base is the new reference.
+    """
+    import pinocchio as pin
+
+    from fflin.control.gain import model_of
+
+    if gain.x0[:6].any():
+        refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
+        pose = gain.placement
+    else:
+        pose = point_of(robot, arguments, "target_")[0][:7]
+    linear = partial(model_of, gain, robot, f"{arguments.gain} was made for '{gain.robot}'")
+    lin = linear(pin.XYZQUATToSE3(pose))
+    if number := arguments.relative_equilibrium:
+        return linear(attitude(robot, lin.q, number, lin.frame)[1])
+    return lin
+
+
+def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
+    """Return the feedback along the trajectory of --trajectory or --schedule."""
+    regulator = ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS)
+    why = (
+        "the trajectory defines the regulator, its target, and the start, which --offset displaces"
+    )
+    refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
+    if arguments.schedule is None:
+        models = models_along(arguments, robot)
+        return fflin.TrajectoryFeedback(models, schedule_of(models, arguments))
+    why = "the file of --schedule already contains the trajectory and the design of its gains"
+    refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
+    schedule = fflin.GainSchedule.load(arguments.schedule)
+    return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
+
+
+def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
+    """Raise an error for invalid options of `pictures`, before a long simulation starts."""
+    from fflin.simulation.plan import LONGEST
+    from fflin.view.visualize import check_outputs, check_rates, check_times, tool_frame
+
+    if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
+        return
+    tool_frame(robot, arguments.tool)
+    duration = arguments.duration or LONGEST
+    check_rates(arguments.fps, arguments.speed, duration)
+    if arguments.times:
+        check_times(arguments.times, 0.0, duration)
+
+
+def pictures(
+    robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
+) -> dict[Path | None, Callable[[Path], object]]:
+    """Return {path: function that writes it} for the requested page and pictures of a motion."""
+    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *SHOWN)}
+
+    def show(path: Path) -> None:
+        fflin.visualize(robot, motion(), **how | {path.suffix.removeprefix("."): path})
+
+    return {getattr(arguments, name): show for name in _FILES}
