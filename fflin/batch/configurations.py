@@ -5,7 +5,7 @@ Configurations are given as an array, or generated on demand by a grid or a rand
 
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -19,10 +19,6 @@ from fflin.dynamics.points import configuration
 from fflin.robot.fields import travel_of
 from fflin.robot.joints import ROUND_OFF, Joint, by_joint
 from fflin.robot.robot import Robot
-
-# Two indices into q for a joint, and a factor. A continuous joint has the indices of (cos, sin);
-# any other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
-Column: TypeAlias = tuple[int, int, float]
 
 # Rows are checked in blocks of this size, which limits the memory for intermediate results.
 _BLOCK = 2048
@@ -262,30 +258,6 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
         robot.joint(name).place(q.T, column)
     robot.follow(q.T)
     return q
-
-
-def values(q: Array, column: Column) -> Array:
-    """Return a joint's angle or length (N,) at configurations (N, nq)."""
-    first, second, scale = column
-    at: Array = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
-    return at / scale
-
-
-def positions(q: Array, columns: Sequence[Column]) -> Array:
-    """Return the angles and lengths (N, joints) at configurations (N, nq)."""
-    found = [values(q, column) for column in columns]
-    return np.column_stack(found) if found else np.empty((len(q), 0))
-
-
-def away(q: Array, column: Column, value: float) -> Array:
-    """Return the distances (N,) of a joint's values from `value`.
-
-    For a continuous joint, the distance is the length of the shorter arc.
-    """
-    distance = values(q, column) - value
-    if column[1] >= 0:
-        distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
-    return np.abs(distance)
 
 
 def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
