@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import eigh
@@ -71,11 +71,8 @@ class Pace(NamedTuple):
     held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
-class Limit(NamedTuple):
-    """Largest bandwidth that a limit permits, and the description of the limit."""
-
-    bandwidth: float
-    what: str
+# Largest bandwidth that a limit permits, and the description of the limit.
+Limit: TypeAlias = tuple[float, str]
 
 
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
@@ -133,7 +130,12 @@ def _of_inertia(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
             "it, or give Q and R"
         )
-    reach = _reach(S, cost, D)
+    # Effect S R^-1 S' of the inputs on the coordinates, which is made positive definite.
+    reach = (S / cost) @ S.T
+    idle = reach.diagonal() <= _IDLE * D
+    reach[idle, idle] = D[idle]
+    if np.linalg.eigvalsh(reach / np.sqrt(np.outer(D, D)))[0] < 1e-9:
+        reach += np.diag(D)
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
     # Scale the cost so that the slowest mode has the bandwidth w.
@@ -143,31 +145,25 @@ def _of_inertia(
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
     # Gain of a loop with a bandwidth of 1 rad/s.
-    stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
-    gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
+    gain = (S / cost).T @ np.linalg.solve(reach, back.T @ (ratios[:, None] ** 0.75 * to_modes))
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
     # Limits on the speeds of the coordinates, and limits on the momenta added to wheels.
-    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
-    room |= momenta
+    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {**momenta}
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
     use = _largest_use(gain, size, lin.state_names)
-    limits = [
-        Limit(pace.bandwidth, ""),
-        *_limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
-        *_limits_on("effort", _efforts_left(lin), use, 2.0),
-    ]
-    limit, achieved = min(limits), ""
+    speeds = _limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0)
+    efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
+    limit, achieved = min([(pace.bandwidth, ""), *speeds, *efforts]), ""
     rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
-        grows = _growth(lin)
-        limit = max(limit, grows._replace(bandwidth=_OF_GROWTH * grows.bandwidth))
-    if pace.hold or lin.dt:
-        fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
-        limit = min(limit, Limit(float(fastest), "the sampling time"))
+        growth, mode = _growth(lin)
+        limit = max(limit, (_OF_GROWTH * growth, mode))
+    if hold := pace.hold or lin.dt:
+        limit = min(limit, (float(pace.held / (hold * rates[-1])), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -179,15 +175,13 @@ def _of_inertia(
         return Q, np.diag(h * cost / w**4)
 
     if loaded:
-        driven = (S**2 / cost).sum(axis=1) > _IDLE * D / unit
-        least = min(grows._replace(bandwidth=_LEAST_OF_GROWTH * grows.bandwidth), limit)
-        limit, achieved = _slowed(lin, costs, size, size * driven, limit, least)
+        least = min((_LEAST_OF_GROWTH * growth, mode), limit)
+        limit, achieved = _slowed(lin, costs, size, size * ~idle, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
-    largest = np.tile(on_positions.diagonal() * size**2, 2), cost * use**2
-    terms = h * np.concatenate(largest)
-    return Weights(*costs(limit.bandwidth), rule, limit.bandwidth, terms)
+    terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
+    return Weights(*costs(limit[0]), rule, limit[0], terms)
 
 
 def _on_velocities(
@@ -235,19 +229,6 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     return size
 
 
-def _reach(S: Array, cost: Array, D: Array) -> Array:
-    """Return the effect S R^-1 S' (m, m) of the inputs on the coordinates; it is positive definite.
-
-    For coordinates on which no input acts, the diagonal has the entries of D.
-    """
-    reach = (S / cost) @ S.T
-    idle = reach.diagonal() <= _IDLE * D
-    reach[idle, idle] = D[idle]
-    if np.linalg.eigvalsh(reach / np.sqrt(np.outer(D, D)))[0] < 1e-9:
-        reach += np.diag(D)
-    return reach
-
-
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
@@ -259,15 +240,10 @@ def _fastest(
     # 1; dampers reduce it.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    if not any(name.startswith("qdot_m.") for name in lin.limits):
-        return np.zeros(len(T))
     first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
     time = np.geomspace(first, 3.0, 60)[:, None]
-    x = rates * time / math.sqrt(2.0)
-    moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
-    if (mass < 1.0).any():
-        fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
-        moving = (rates**2 * (slow - fast) / root).real
+    fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
+    moving = (rates**2 * (slow - fast) / root).real
     return _largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
@@ -284,12 +260,12 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
         each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
         from_where.append(f"{each} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
-    slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
+    slow = f"; bandwidth limited by {limit[1]}" if limit[1] else ""
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += (
             f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
         )
-    pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
+    pace = achieved or f"bandwidth at least {limit[0]:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
 
 
@@ -313,7 +289,7 @@ def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) 
     `power`.
     """
     return [
-        Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
+        ((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]
@@ -331,7 +307,7 @@ def _growth(lin: LinearModel) -> Limit:
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
     moving = listed(_moving_most(lin, modes[:, [k]]))
-    return Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
+    return fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})"
 
 
 def _slowed(
@@ -349,10 +325,12 @@ def _slowed(
     `driven`, which are zero for joints without a motor, because springs or gravity move them. The
     second result is a description of the achieved loop.
     """
-    # Each trial has its bandwidth, the strictest effort limit, a report and the inputs (nu,).
-    trials = list[tuple[Limit, Limit, str, Array]]()
+    # Each trial has the factor on its bandwidth at which an effort reaches its limit, the name of
+    # this effort, the bandwidth, a report and the inputs (nu,).
+    trials = list[tuple[float, str, Limit, str, Array]]()
     for _ in range(_TRIALS):
-        Q, R = costs(limit.bandwidth)
+        w, _ = limit
+        Q, R = costs(w)
         try:
             K = solve(lin.A, lin.B, Q, R, None, lin.dt).K
         except np.linalg.LinAlgError:
@@ -366,36 +344,36 @@ def _slowed(
             _largest_use(K, size, lin.state_names),
             _largest_use(later, driven, lin.state_names).max(axis=0),
         )
-        left = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=Limit(1.0, ""))
+        left, effort = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=(1.0, ""))
         decay, fast = -rates.real, np.abs(rates)
         said = (
             f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
             f"1/s, damping ratio at least {(decay / fast).min():.2g}"
         )
-        slow = decay < _AS_SLOW * math.sqrt(0.5) * limit.bandwidth
+        slow = decay < _AS_SLOW * math.sqrt(0.5) * w
         if names := _moving_most(lin, modes[:, slow]):
             said += f"; modes decaying more slowly: {listed(names)}"
-        if left.bandwidth >= 1.0 - 1e-6:
+        if left >= 1.0 - 1e-6:
             return limit, said
-        trials.append((limit, left, said, np.abs(lin.u0) + use))
-        if limit.bandwidth <= least.bandwidth:
+        trials.append((left, effort, limit, said, np.abs(lin.u0) + use))
+        if w <= least[0]:
             break
         # Springs and gravity require efforts even if the loop is very slow, so the bandwidth is
         # reduced in steps.
-        slower = min(max(left.bandwidth, 0.3), 0.8) * limit.bandwidth
-        limit = max(left._replace(bandwidth=slower), least)
+        limit = max((min(max(left, 0.3), 0.8) * w, effort), least)
     if not trials:
         return limit, ""  # the design of the regulator fails and reports the reason
-    most = max(left for _, left, *_ in trials).bandwidth
-    found = next(trial for trial in trials if trial[1].bandwidth >= _IN_VAIN * most)
-    limit, (_, effort), said, required = found
+    enough = _IN_VAIN * max(left for left, *_ in trials)
+    _, effort, (w, reason), said, required = next(x for x in trials if x[0] >= enough)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
-    held = limit.what == least.what  # a slower loop cannot control the unstable mode
-    what = f"{limit.what}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    return limit._replace(what=what), said
+    held = reason == least[1]  # a slower loop cannot control the unstable mode
+    return (
+        w,
+        f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}",
+    ), said
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:

@@ -90,6 +90,8 @@ class LinearController(Feedback):
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
         The controller from all outputs to all inputs of the model, with `sign` applied.
+    dt : float
+        Sampling time [s]; 0 in continuous time.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -152,17 +154,13 @@ class LinearController(Feedback):
                 "the model, or give the continuous model"
             )
         self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
+        self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
         time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
         return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
-        return float(self.system.dt)
 
     def terms(self, _: float = 0.0) -> Sample:
         """Return the matrices and offsets, which are the same at all times."""

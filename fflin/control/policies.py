@@ -172,10 +172,10 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        self._states = [
-            StateMap(each, reference=reference, frame=frame) for each in (allocation.design, robot)
-        ]
-        self._design, self._robot = map(Actuation, self._states)
+        self._design, self._robot = (
+            Actuation(StateMap(each, reference=reference, frame=frame))
+            for each in (allocation.design, robot)
+        )
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
@@ -197,14 +197,12 @@ class AllocatedPolicy:
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
-        asked, given = self._states
-        u = self._design.in_base_axes(asked.chart(q), self._command(t, q, v))
+        state = self._design.state
+        chart = state.chart(q)
+        u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
-        columns = self._robot.columns(self._data, q)
-        for held in self._robot.held:
-            columns = columns.copy()
-            columns[:, held] = columns[:, held] @ given.chart(q).R.T
-        M = asked.project(pin.crba(asked.robot.model, self._design_data, q).T)
+        columns = chart.to_reference(self._robot.held, self._robot.columns(self._data, q).T).T
+        M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
         return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)

@@ -156,8 +156,7 @@ class Aba:
         for joint, leader, *_ in state.robot.followers:
             rotor[[joint.idx_v, leader.idx_v]] = shared[leader.idx_v]
         model.armature = model.armature + rotor
-        upper = pin.computeMinverse(model, data, q)
-        with_rotor = np.linalg.inv(np.triu(upper) + np.triu(upper, 1).T)
+        with_rotor = np.linalg.inv(pin.computeMinverse(model, data, q))
         by_force = np.linalg.inv(S.T @ with_rotor @ S - (S.T * rotor) @ S)
         to_independent = by_force @ S.T @ with_rotor
         free = pin.aba(model, data, q, v, tau, external)

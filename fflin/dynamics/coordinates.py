@@ -218,24 +218,20 @@ def readout(
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
     circling, cos = state.unbounded, idx_q[state.unbounded]
     middle = near[g.q_m][circling]
-    # f = gains z, where z stacks q, v, the angles of continuous joints, R omega, R v and 1.
+    # x = S z, where z stacks q, v, the angles of continuous joints, R omega, R v and 1.
     ends = np.cumsum((robot.nq, robot.nv, len(circling), 3, 3))
-    gains = np.zeros((len(K), ends[-1] + 1))
-    of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(gains, ends, axis=1)
-    at = state.origin
-    of_q[:, :3] = -K[:, g.r_b] @ at.rotation
-    turn = turning.product_matrix(state.origin_quaternion)
-    of_q[:, 3:7] = -K[:, g.q_b] @ turn[:3]
-    constant[:, 0] = offset - K[:, g.r_b] @ at.translation
-    of_q_m = -K[:, g.q_m]
-    of_q[:, idx_q] = of_q_m / [joint.scale for joint in robot.joints]
+    S = np.zeros((state.nx, ends[-1] + 1))
+    of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(S, ends, axis=1)
+    at, turn = state.origin, turning.product_matrix(state.origin_quaternion)
+    of_q[g.q_b, 3:7], of_q[g.r_b, :3], constant[g.r_b, 0] = turn[:3], at.rotation, at.translation
+    of_q[g.q_m][np.arange(robot.n), idx_q] = [1.0 / joint.scale for joint in robot.joints]
     of_q[:, cos] = 0.0
-    of_angles[:] = of_q_m[:, circling]
-    of_rates = -K[:, 6 + robot.n :].copy()
-    for part, of_part in compress(((ANGULAR, of_angular), (LINEAR, of_linear)), state.axes):
-        of_part[:] = of_rates[:, part] @ at.rotation
-        of_rates[:, part] = 0.0
-    of_v[:] = state.lift(of_rates.T).T
+    of_angles[6 + circling] = np.eye(len(circling))
+    of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
+    for group, of_part in compress(((g.omega_b, of_angular), (g.v_b, of_linear)), state.axes):
+        of_v[group], of_part[group] = 0.0, at.rotation
+    gains = -K @ S
+    gains[:, -1] += offset
 
     z = np.zeros(gains.shape[1])
     z[-1] = 1.0

@@ -191,9 +191,7 @@ def struck(
 
 def inertia_at(robot: Robot, q: Array) -> Array:
     """Return the joint-space inertia M (nv, nv) for Pinocchio's v."""
-    M = np.triu(pin.crba(robot.model, robot.create_data(), q.copy()))
-    full: Array = M + np.triu(M, 1).T
-    return full
+    return np.asarray(pin.crba(robot.model, robot.create_data(), q.copy()))
 
 
 def momentum_of(robot: Robot, q: Array, v: Array) -> Array:

@@ -157,21 +157,13 @@ def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     """Return the integral of e^(F' t) W e^(F t) over [0, h]; F and h may have leading axes."""
     # The rounding error of an exponential is relative to its largest block, so W is scaled to the
     # size of F.
-    square, h, n = F @ F, np.asarray(h)[..., None, None], F.shape[-1]
-    if not (square @ F).any():
-        total = np.zeros(F.shape)
-        terms = (np.eye(n), F, 0.5 * square)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for i, left in enumerate(terms):
-                for j, right in enumerate(terms):
-                    total += left.mT @ W @ right * (h ** (i + j + 1) / (i + j + 1))
-            return 0.5 * (total + total.mT)
     from scipy.linalg import expm
 
-    rate, weight = (float(np.abs(X).sum(axis=-2).max()) for X in (F, W))
+    h, n = np.asarray(h)[..., None, None], F.shape[-1]
+    rate, weight = (float(np.abs(X).sum(axis=-2).max()) or 1.0 for X in (F, W))
     doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
     block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
-    size = weight / rate or 1.0
+    size = weight / rate
     block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))

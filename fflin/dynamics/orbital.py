@@ -198,19 +198,16 @@ class GravityGradient(NamedTuple):
         turns = zip((weight * n * n for weight in _WEIGHTS), (R.T @ field.axes).T, strict=True)
         return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ position))
 
-    def force(self, model: pin.Model, data: pin.Data, q: Array) -> Array:
-        """Return the generalised force (nv,) relative to the free fall of the base's origin."""
-        total, v = np.zeros(model.nv), np.zeros(model.nv)
-        for weight, v[PIN_ANGULAR] in self.turns:
-            total += weight * pin.nonLinearEffects(model, data, q, v)
-        return total
+    def force(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array, Array]:
+        """Return the generalised force (nv,) relative to the free fall of the base's origin.
 
-    def slopes(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array]:
-        """Return the derivatives of `force` over q (nv, nv) and over base rotations (nv, 3)."""
+        Return also its derivatives over q (nv, nv) and over base rotations (nv, 3).
+        """
+        total, v, at_rest = np.zeros((3, model.nv))
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))
-        v, at_rest = np.zeros(model.nv), np.zeros(model.nv)
         for weight, v[PIN_ANGULAR] in self.turns:
             over_q, over_v, _ = pin.computeRNEADerivatives(model, data, q, v, at_rest)
+            total += weight * data.tau
             by_q += weight * over_q
             by_turn += weight * over_v[:, PIN_ANGULAR] @ skew(v[PIN_ANGULAR])
-        return by_q, by_turn
+        return total, by_q, by_turn

@@ -75,14 +75,8 @@ def _center_of_mass_derivatives(at: Point, to: Sensed) -> None:
 
 
 def _center_of_mass(world: Measuring, _: object) -> Array:
-    return np.asarray(world.reference.actInv(_center(world)))
-
-
-def _center(world: Measuring) -> Array:
-    model, data = world.model, world.data
-    bodies = [(model.inertias[i], data.oMi[i]) for i in range(1, model.njoints)]
-    moments = [inertia.mass * placement.act(inertia.lever) for inertia, placement in bodies]
-    return np.asarray(sum(moments) / sum(inertia.mass for inertia, _ in bodies))
+    center = pin.centerOfMass(world.model, world.data, pin.KinematicLevel.POSITION)
+    return np.asarray(world.reference.actInv(center))
 
 
 def _momentum_derivatives(at: Point, to: Sensed) -> None:
@@ -104,13 +98,11 @@ def _momentum_derivatives(at: Point, to: Sensed) -> None:
 
 
 def _momentum(world: Measuring, _: object) -> Array:
-    model, data, turned = world.model, world.data, world.reference.rotation.T
-    momenta = [data.oMi[i].act(model.inertias[i] * data.v[i]) for i in range(1, model.njoints)]
-    linear = sum(h.linear for h in momenta)
-    angular = sum(h.angular for h in momenta) - np.cross(_center(world), linear)
+    h, turned = pin.computeCentroidalMomentum(world.model, world.data), world.reference.rotation.T
+    angular = h.angular.copy()
     for joint, stored in world.stored:
-        angular += data.oMi[joint].rotation @ stored
-    return np.concatenate((turned @ angular, turned @ linear))
+        angular += world.data.oMi[joint].rotation @ stored
+    return np.concatenate((turned @ angular, turned @ h.linear))
 
 
 def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) -> None:

@@ -53,10 +53,8 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides: list[int] = []
-        for joint in robot.joints:
-            if joint.prismatic and joint.kind != "modal":
-                self._slides.append(joint.idx_q)
+        slides = [joint for joint in robot.joints if joint.prismatic and joint.kind != "modal"]
+        self._slides = [joint.idx_q for joint in slides]
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)
@@ -196,7 +194,7 @@ class Accelerations:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
         self._model, self._nv = robot.model, 6 + robot.n
-        self._inertia = Inertia(state, data)
+        self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
         # Derivatives of M a + b - B u - springs over the displacements of the state. They are
@@ -210,9 +208,7 @@ class Accelerations:
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored: list[tuple[int, Array]] = []
-        for mounted, momentum in robot.stored_momentum:
-            self._stored.append((mounted, skew(momentum)))
+        self._stored = [(mounted, skew(momentum)) for mounted, momentum in robot.stored_momentum]
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
@@ -220,11 +216,11 @@ class Accelerations:
         """Write the derivatives over u (6 + n, nu) at rest into a C-contiguous array."""
         default = self._actuation.default
         inverse = out if default else np.empty((self._nv, self._nv))
-        self._inertia.invert(q, inverse, quick=True)
+        self.inertia.invert(q, inverse, quick=True)
         if not default:
             # The input matrix does not depend on the base position. So the base is moved to the
             # origin, which avoids rounding errors.
-            columns = self._actuation.columns(self._data, self._inertia.centred(q))
+            columns = self._actuation.columns(self._data, self.inertia.centred(q))
             np.matmul(inverse, columns, out=out)
 
     def rates(
@@ -241,14 +237,13 @@ class Accelerations:
         # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
         # is left out as well, because it accelerates all parts of the robot alike (equivalence
         # principle).
-        q_still, v_still = self._inertia.centred(q), self._still
+        q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
-            pull = tide.force(model, data, q_still)
-            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
+            pull, pull_by_q, pull_by_turn = tide.force(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
-        self._inertia.invert(q_still, inverse, quick=not self._resists)
+        self.inertia.invert(q_still, inverse, quick=not self._resists)
         columns = actuation.columns(data, q_still)
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         wrenches = actuation.wrenches(u)

@@ -240,9 +240,7 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
-        in_frame = nu
-        if not chart.standing:
-            in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:
@@ -391,10 +389,9 @@ class Actuation:
         for item, own in kinds.named_inputs(robot.inputs):
             at, unit = len(columns), item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
-                torque = isinstance(item, kinds.BaseTorque)
-                rows = ANGULAR if torque else LINEAR
+                rows = ANGULAR if isinstance(item, kinds.BaseTorque) else LINEAR
                 columns += list(identity[rows])
-                if state.axes[0 if torque else 1]:
+                if rows in state.in_reference:
                     held.append(slice(at, at + 3))
             elif isinstance(item, kinds.JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
@@ -419,9 +416,8 @@ class Actuation:
         self.units = self.input_units = tuple(units)
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
         # the order in which they first appear.
-        self.groups: dict[str, Indices] = {}
-        for group in dict.fromkeys(groups):
-            self.groups[group] = np.flatnonzero(np.array(groups) == group)
+        kind = np.array(groups)
+        self.groups = {group: np.flatnonzero(kind == group) for group in dict.fromkeys(groups)}
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose

@@ -1,6 +1,6 @@
 """Conversion of control laws to the tables of their C code, with test cases from fflin."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -96,11 +96,24 @@ def law_of(given: object, robot: object, limits: object) -> Law:
         )
     robot = instance("robot", robot, Robot, "a Robot")
     if isinstance(given, LinearController | Compensator):
-        return _output_law(given, lin, robot, limits)
-    return _state_law(given, lin, robot, limits)
+        law = _output_law(given, lin, robot)
+    else:
+        law = _state_law(given, lin, robot)
+    names, _ = law.inputs
+    high = np.full(len(names), np.inf)
+    low = -high
+    if limits is not None:
+        if Actuation(StateMap(robot)).names != tuple(names):
+            raise InputError(
+                "limits need the robot with the inputs of the law; give the robot of the design "
+                "with robot= (--robot)"
+            )
+        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
+    law.tables.update(low=low, high=high)
+    return law
 
 
-def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: object) -> Law:
+def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot) -> Law:
     axes: dict[str, Array] = {}
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
@@ -120,8 +133,6 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
         _, _, x0 = laws[0].terms(state)
         tables = {"reference": lin.placement[None], "x0": x0[None], "u0": lin.u0[None]}
         tables["K"] = np.array([law.terms(state)[0] for law in laws])
-    actuation = Actuation(state)
-    tables |= _limits(robot, limits, actuation.names)
     cases = list(_state_cases(state, bound(given, robot), dt, tables, axes))
     tables["in_reference_axes"] = np.array(state.axes)
     tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
@@ -135,8 +146,8 @@ def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot, limits: o
     return Law(
         title=title,
         state=state,
-        signals=(state.names, state.units),
-        inputs=(actuation.names, actuation.units),
+        signals=signals_of(state, "state"),
+        inputs=signals_of(state, "input"),
         dt=dt,
         robot=robot,
         lin=lin,
@@ -202,20 +213,6 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
     return model_of(gain, robot, made, pin.XYZQUATToSE3(gain.placement))
 
 
-def _limits(robot: Robot, limits: object, names: Sequence[str]) -> dict[str, Array]:
-    """Return the least and largest inputs (nu,); without `limits`, they are infinite."""
-    high = np.full(len(names), np.inf)
-    low = -high
-    if limits is not None:
-        if Actuation(StateMap(robot)).names != tuple(names):
-            raise InputError(
-                "limits need the robot with the inputs of the law; give the robot of the design "
-                "with robot= (--robot)"
-            )
-        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
-    return {"low": low, "high": high}
-
-
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     """Return tables with one row for each sample; the last row applies after the trajectory."""
     if not (dt := policy.schedule.dt):
@@ -223,10 +220,8 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
             "tvlqr(..., sample=dt) (fflin tvlqr --sample)"
         )
-    last = int(np.ceil(policy.over / dt * (1.0 - 1e-12)))
-    while last * dt <= policy.over:
-        last += 1
-    times = dt * np.arange(last + 1)
+    times = dt * np.arange(int(policy.over / dt) + 3)
+    times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
     attitudes = [quaternion_product(state.origin_quaternion, each) for each in q[:, 3:7]]
     pose = np.zeros((len(q), 6))
@@ -239,12 +234,11 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
 
 
 def _output_law(
-    given: LinearController | Compensator, lin: LinearModel | None, robot: Robot, limits: object
+    given: LinearController | Compensator, lin: LinearModel | None, robot: Robot
 ) -> Law:
     if isinstance(given, LinearController):
         terms, lin = given.terms(), given.lin
-        inputs = lin.input_names, lin.input_units
-        signals = lin.output_names, lin.output_units
+        inputs, signals = (lin.input_names, lin.input_units), (lin.output_names, lin.output_units)
     else:
         none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
@@ -271,7 +265,7 @@ def _output_law(
         dt=given.dt,
         robot=robot,
         lin=lin,
-        tables=tables | _limits(robot, limits, inputs[0]),
+        tables=tables,
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
     )

@@ -82,11 +82,6 @@ def joint_position(robot, q, joint):
     return value / load(robot.scale, joint)
 
 
-def seen(robot, q):
-    """Return the base's quaternion relative to the reference."""
-    return vec.quaternion_times(vec.attitude(robot.origin), vec.attitude(q))
-
-
 def apply_faults(faults, triads, t, u, given):
     """Write the inputs that faulty actuators produce for a command u at a time t."""
     for index in range(len(faults.gain)):
@@ -101,8 +96,8 @@ def turn_held(robot, point):
     """Rotate reference-frame wrenches to base axes."""
     pushing = point.pushing
     for index in range(len(robot.held)):
-        at = robot.held[index]
-        axes = vec.columns_of(seen(robot, point.q))
+        at, turn = robot.held[index], vec.attitude(robot.origin)
+        axes = vec.columns_of(vec.quaternion_times(turn, vec.attitude(point.q)))
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
 

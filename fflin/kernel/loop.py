@@ -178,16 +178,17 @@ class Arguments(
     """
 
 
+_OF_METHOD = {REAL: "h", INDICES: "origin", LANED: "rates along first second u"}
+METHOD, STOP_CONDITIONS = Struct(Method, REALS, _OF_METHOD), Struct(StopConditions)
 ARGUMENTS = Struct(
     Arguments,
+    FLAG,
     robot=MECHANICS,
-    method=Struct(Method, REALS, {LANED: "rates along first second u"}, h=REAL, origin=INDICES),
+    method=METHOD,
     law=LAW,
     channel=CHANNEL,
     reference=MOMENTUM_REFERENCE,
-    project=FLAG,
-    pushed=FLAG,
-    stop=Struct(StopConditions),
+    stop=STOP_CONDITIONS,
     point=POINT,
 )
 
@@ -305,18 +306,10 @@ class RunStatistics(
     """
 
 
+_LANED = "sizes largest_x largest_u largest outside errors inputs states"
+_OF_STATISTICS = {INDICES: "kind steps", REAL: "settled", LANED: _LANED}
 RUN_STATISTICS = Struct(
-    RunStatistics,
-    REALS,
-    {
-        INDICES: "kind steps",
-        LANED: "sizes largest_x largest_u largest outside errors inputs states",
-    },
-    robot=MECHANICS,
-    law=LAW,
-    path=PATH,
-    settled=REAL,
-    at=POINT,
+    RunStatistics, REALS, _OF_STATISTICS, robot=MECHANICS, law=LAW, path=PATH, at=POINT
 )
 
 

@@ -50,14 +50,7 @@ def _cubic(coefficients, k, s, out):
 
 def _latest(knots, time):
     """Return the index of the last knot at or before a time, 0 if the time is before all knots."""
-    low, high = 0, len(knots)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if knots[middle] <= time:
-            low = middle
-        else:
-            high = middle
-    return low
+    return max(np.searchsorted(knots, time, side="right") - 1, 0)
 
 
 def _placed(knots, time):
@@ -68,36 +61,6 @@ def _placed(knots, time):
     if s > 1.0 - _NEAR and k < last:
         k, s = k + 1, 0.0
     return k, 0.0 if s < _NEAR else min(s, 1.0)
-
-
-def _follow(robot, path, t):
-    """Write the point of the trajectory at a time, with u in base axes.
-
-    Return whether the trajectory has ended.
-    """
-    point, last, knots = path.point, len(path.t) - 2, path.t
-    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
-    k, s = _placed(knots, time)
-    at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
-    if after:
-        k, at, share = last + 2, last + 2, 0.0
-    vec.copy(path.q, k * len(point.q), point.q, 0, len(point.q))
-    count = len(point.u)
-    for index in range(count):
-        value = path.u[at * count + index]
-        if share > 0.0 and not path.hold:
-            value += share * (path.u[(at + 1) * count + index] - value)
-        point.u[index] = value
-    if after:
-        vec.copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))
-    else:
-        _cubic(path.shift, k, s, path.along)
-        _cubic(path.speed, k, s, point.nu)
-        vec.displace(robot.tree, point.q, path.along, point.q)
-    for index in range(len(path.held)):
-        at = path.held[index]
-        vec.put3(point.u, at, vec.across(vec.axes_of(point.q), vec.get3(point.u, at)))
-    return after
 
 
 def error(robot, path, point):
@@ -122,17 +85,39 @@ def error(robot, path, point):
 
 
 def track(robot, path, point, u, t):
-    """Write the inputs u* - K e at the time t of the run."""
-    after = _follow(robot, path, t)
+    """Write the inputs u* - K e at the time t of the run, with u* in base axes."""
+    # The point of the trajectory at this time.
+    there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)
+    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
+    k, s = _placed(knots, time)
+    at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
+    if after:
+        k, at, share = last + 2, last + 2, 0.0
+    vec.copy(path.q, k * len(there.q), there.q, 0, len(there.q))
+    for index in range(count):
+        value = path.u[at * count + index]
+        if share > 0.0 and not path.hold:
+            value += share * (path.u[(at + 1) * count + index] - value)
+        there.u[index] = value
+    if after:
+        vec.copy(path.speed, 4 * (last + 1) * len(there.nu), there.nu, 0, len(there.nu))
+    else:
+        _cubic(path.shift, k, s, path.along)
+        _cubic(path.speed, k, s, there.nu)
+        vec.displace(robot.tree, there.q, path.along, there.q)
+    for index in range(len(path.held)):
+        at = path.held[index]
+        vec.put3(there.u, at, vec.across(vec.axes_of(there.q), vec.get3(there.u, at)))
+    # Its error, and the gain at this time.
     error(robot, path, point)
-    starts, count, width = path.starts, len(path.point.u), len(path.e)
+    starts, width = path.starts, len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
     k = _latest(starts, since)
     since = 0.0 if after else since - starts[k]
     k = len(starts) if after else k
     first, size = k * path.order * count * width, count * width
     for row in range(count):
-        total = splat(u, path.point.u[row])
+        total = splat(u, there.u[row])
         for column in range(width):
             at, gain = first + row * width + column, 0.0
             for power in range(path.order - 1, -1, -1):
@@ -186,19 +171,10 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """
 
 
-LAW = Struct(
-    Law,
-    REALS,
-    {LANED: "x y added u"},
-    kind=WHOLE,
-    turned=FLAGS,
-    grid=Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED),
-    filter=Struct(Filter, z=LANED, rates=LANED),
-    measured=INDICES,
-    gyros=INDICES,
-    path=PATH,
-    allocation=ALLOCATION,
-)
+GRID = Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED)
+FILTER = Struct(Filter, z=LANED, rates=LANED)
+_OF_LAW = {WHOLE: "kind", FLAGS: "turned", INDICES: "measured gyros", LANED: "x y added u"}
+LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocation=ALLOCATION)
 
 
 @called
@@ -225,21 +201,6 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
-def _measure(work, robot, law, point, count):
-    """Write the outputs y of a sample, including its noise."""
-    outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
-    if len(gyros) > 0:
-        move_bodies(work, tree, point.nu)
-    for index in range(len(gyros)):
-        rate = vec.get3(work, tree.motion + gyros[index] * MOTION)
-        axes = vec.get_columns(work, tree.places + gyros[index] * PLACE)
-        rate = vec.across(vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate))
-        vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
-    added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
-    for index in range(outputs):
-        store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
-
-
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
     total, width = splat(x, 0.0), len(x)
@@ -255,7 +216,18 @@ def command(work, robot, law, point, t, count, stage):
         return
     row = min(count, len(law.origin) // 7 - 1)
     read_state(robot, law, point, row)
-    _measure(work, robot, law, point, count)
+    # The outputs y of the sample, including its noise.
+    outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
+    if len(gyros) > 0:
+        move_bodies(work, tree, point.nu)
+    for index in range(len(gyros)):
+        rate = vec.get3(work, tree.motion + gyros[index] * MOTION)
+        axes = vec.get_columns(work, tree.places + gyros[index] * PLACE)
+        rate = vec.across(vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate))
+        vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
+    added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
+    for index in range(outputs):
+        store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
     if len(law.grid.joint) > 0:
         _feed_back_between(robot, law, point)
     else:

@@ -247,9 +247,8 @@ class ModelDerivatives:
         """
         state, data, q, gradient = self._state, self._data, self._q, self._gradient
         by_turn: Array = np.zeros((len(self._v), 3))
-        if gradient:  # before RNEA, because these calls overwrite Pinocchio's results
-            pull = gradient.force(model, data, q)
-            pull_by_q, by_turn = gradient.slopes(model, data, q)
+        if gradient:  # before RNEA, because this call overwrites Pinocchio's results
+            pull, pull_by_q, by_turn = gradient.force(model, data, q)
         a = state.spread(self._rates.c)
         by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, self._v, a)
         tau = np.array(data.tau)
