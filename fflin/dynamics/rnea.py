@@ -212,17 +212,6 @@ class Accelerations:
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
-    def write_by_u(self, q: Array, out: Array) -> None:
-        """Write the derivatives over u (6 + n, nu) at rest into a C-contiguous array."""
-        default = self._actuation.default
-        inverse = out if default else np.empty((self._nv, self._nv))
-        self.inertia.invert(q, inverse, quick=True)
-        if not default:
-            # The input matrix does not depend on the base position. So the base is moved to the
-            # origin, which avoids rounding errors.
-            columns = self._actuation.columns(self._data, self.inertia.centred(q))
-            np.matmul(inverse, columns, out=out)
-
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:

@@ -271,9 +271,9 @@ class Linearizer:
             self._fields["_reference"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether only B must be computed for a model at rest. This requires the default outputs
+        # Whether only B must be computed for a model at rest. This requires default inputs, outputs
         # and reference, and no springs, gravity, orbit or stored momentum.
-        self._known = ready.free and ready.own_reference
+        self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -288,7 +288,7 @@ class Linearizer:
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
-                self._accelerations.write_by_u(q, B[self._lower])
+                self._accelerations.inertia.invert(q, B[self._lower], quick=True)
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
@@ -298,8 +298,14 @@ class Linearizer:
 
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
+        inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
         with self._lock:
-            self._accelerations.write_by_u(q, out)
+            inverse = out if actuation.default else np.empty((nv, nv))
+            inertia.invert(q, inverse, quick=True)
+            if not actuation.default:
+                # The input matrix does not depend on the base position. So the base is moved to the
+                # origin, which avoids rounding errors.
+                np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy cannot share the work space, so the constructor builds it again.
