@@ -301,7 +301,7 @@ class Linearizer:
         inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
         with self._lock:
             inverse = out if actuation.default else np.empty((nv, nv))
-            inertia.invert(q, inverse, quick=True)
+            inertia.invert(q, inverse)
             if not actuation.default:
                 # The input matrix does not depend on the base position. So the base is moved to the
                 # origin, which avoids rounding errors.
