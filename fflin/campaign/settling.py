@@ -47,7 +47,6 @@ class Loop:
 
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
         instance("robot", robot, Robot, "a fflin.Robot")
-        instance("lin", lin, LinearModel, "a fflin.LinearModel")
         K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
         kept = getattr(gain, "regulated", ())
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
