@@ -269,10 +269,8 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-            # A finite sum shows that all entries are finite.
-            finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
         # Comparisons with NaN are false, so rows with NaN count as doubtful.
-        doubtful = ~((excess <= ROUND_OFF) & finite)
+        doubtful = ~((excess <= ROUND_OFF) & np.isfinite(block).all(axis=1))
         if robot.followers:
             followed = block.copy()
             robot.follow(followed.T)
@@ -302,11 +300,7 @@ def checked_rows(
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))
     rows = _rows(name, given, size, "one row for each point", count)
-    with np.errstate(all="ignore"):
-        # A finite sum shows that all entries are finite.
-        sure = not every and np.isfinite(rows.sum())
-    doubtful = np.zeros(count) if sure else ~np.isfinite(rows).all(axis=1) | every
-    for row in np.flatnonzero(doubtful).tolist():
+    for row in np.flatnonzero(~np.isfinite(rows).all(axis=1) | every).tolist():
         with located(f"row {row}"):
             check(rows[row])
     return frozen(rows)

@@ -52,11 +52,10 @@ _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 # Warning filters belong to the whole process, so only one thread at a time changes them.
 _TURN = Lock()
 
-# Attributes that identify a robot, in addition to its Pinocchio model and the springs of its
-# joints.
+# Attributes that identify a robot, in addition to its Pinocchio model.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "gravity", "orbit"),
+    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "orbit"),
 )
 
 
@@ -379,7 +378,6 @@ class SweepTask:
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
         placements = [placement.homogeneous for placement in robot.model.jointPlacements]
         settings = [getattr(robot, key) for key in _OF_THE_ROBOT]
-        settings += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
         settings += [prepared.map.frame, prepared.moving, prepared.own_reference]
         settings += [self.job.only_inertia, __version__, pin.__version__, self.count]
         points = dict(vars(self._points)) if self._points else {}
