@@ -6,7 +6,7 @@ Configurations are given as an array, or generated on demand by a grid or a rand
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -260,8 +260,19 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
     return q
 
 
-def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
-    """Return a copy of configurations (N, nq) that satisfy `Robot.checked_configuration`."""
+def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
+    """Return configurations of a robot: a corrected array (N, nq), or points that are generated.
+
+    The rows of the array satisfy `Robot.checked_configuration`.
+    """
+    if isinstance(q, Grid | RandomConfigurations):
+        # The robot of the points can have other inputs or outputs, but must have equal joints.
+        if q.robot.joints != robot.joints:
+            raise InputError(
+                f"q was made for '{q.robot.name}', whose joints differ from the joints of "
+                f"'{robot.name}'; make q for the robot that is swept"
+            )
+        return replace(q, robot=robot)
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]

@@ -224,7 +224,8 @@ class FileStore:
         texts: Mapping[str, str],
     ) -> None:
         self.path, self.part, self.count = path, part_of(path), count
-        self._shapes, self._constants, self._texts = shapes, constants, texts
+        self._shapes, self._constants = shapes, constants
+        self._texts = {**texts, "constant": json.dumps(list(constants))}
         self.resumed = self.part.exists()
         with self._reported():
             if not self.resumed:

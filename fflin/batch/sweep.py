@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -21,13 +19,7 @@ from fflin.base import __version__
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import content_digest
 from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
-from fflin.batch.configurations import (
-    Configurations,
-    Grid,
-    RandomConfigurations,
-    checked_configurations,
-    checked_rows,
-)
+from fflin.batch.configurations import Configurations, checked_points, checked_rows
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
@@ -171,7 +163,7 @@ def sweep(
         store = MemoryStore(count, size, task.shapes, task.given)
     else:
         store = FileStore(
-            path, task.request, count, size, task.shapes, task.constants, task.texts()
+            path, task.request, count, size, task.shapes, task.constants, task.header()
         )
     with closing(store), how:
         of_what = "configurations"
@@ -298,18 +290,10 @@ class SweepTask:
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
         # `_points` generates configurations on demand. `_known` contains the given arrays; a single
         # velocity or input for all points is broadcast to rows.
-        self._points, self._known = None, dict[str, Array]()
-        if isinstance(q, Grid | RandomConfigurations):
-            # The robot of the points can have other inputs or outputs, but must have equal joints.
-            if q.robot.joints != robot.joints:
-                raise InputError(
-                    f"q was made for '{q.robot.name}', whose joints differ from the joints of "
-                    f"'{robot.name}'; make q for the robot that is swept"
-                )
-            self._points = replace(q, robot=robot)
-        else:
-            self._known["q"] = checked_configurations(robot, q)
-        self.count = count = len(self._points or self._known["q"])
+        points = checked_points(robot, q)
+        self._points = None if isinstance(points, np.ndarray) else points
+        self._known = {"q": points} if isinstance(points, np.ndarray) else {}
+        self.count = count = len(points)
         if v is not None:
             every = bool(robot.followers)
             check = robot.checked_velocity
@@ -356,11 +340,10 @@ class SweepTask:
         )
         return LinearBatch(**rows, columns=columns, _asked=common)
 
-    def texts(self) -> dict[str, str]:
-        """Return the strings that a file of the batch contains."""
+    def header(self) -> dict[str, str]:
+        """Return the header of a file of the batch."""
         example = {key: np.empty((1, *shape)) for key, shape in self.shapes.items()}
-        header = self.batch(example | self.rows(0, 1)).header(self.count)
-        return {**header, "constant": json.dumps(list(self.constants))}
+        return self.batch(example | self.rows(0, 1)).header(self.count)
 
     @property
     def request(self) -> str:
