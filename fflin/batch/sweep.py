@@ -73,9 +73,9 @@ def sweep(
     If numba is installed (``pip install 'fflin[fast]'``), a compiled kernel processes groups of
     eight points on all threads. If the robot is at rest and no springs, gravity or other forces
     act, only :math:`B = [0;\, M^{-1}]` depends on the point, so the kernel computes nothing else.
-    The kernel also supports operating points in motion. Without numba, for fewer than eight points,
-    or if the robot has outputs other than its state, a `Linearizer` processes the points one by
-    one. With `executor` or `workers`, the points are distributed over worker processes.
+    The kernel also supports operating points in motion. Without numba, or if the robot has outputs
+    other than its state, a `Linearizer` processes the points one by one. With `executor` or
+    `workers`, the points are distributed over worker processes.
 
     Parameters
     ----------
@@ -235,8 +235,17 @@ class ChunkJob:
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code, and return the indices of rows that Python must compute."""
         kernel, q = self._kernel, rows["q"]
-        if kernel is None or len(q) < LANES:  # the kernel computes at least eight points
-            return np.arange(len(q))
+        count = len(q)
+        if kernel is None:
+            return np.arange(count)
+        if count < LANES:  # fill up the lanes by repeating the last row
+            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
+            for key, array in out.items():
+                more[key] = np.empty((LANES, *array.shape[1:]))
+            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
         with np.errstate(all="ignore"):
             if self.only_inertia:
                 good = kernel.write_inverse(q, out["B_lower"])
