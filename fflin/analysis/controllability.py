@@ -19,8 +19,7 @@ from fflin.base.errors import (
     StabilizabilityError,
     listed,
 )
-from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, Values
+from fflin.base.validation import Array, Values
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
@@ -33,8 +32,8 @@ _LOOPS = (
 _RANK = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class Controllability(FrozenArrays):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Controllability(ranks.RankAnalysis):
     """Controllability of a linear model; ``print`` shows a summary.
 
     Attributes
@@ -80,32 +79,20 @@ class Controllability(FrozenArrays):
     (('q_b.x', 'q_b.y', 'q_b.z'), ('linear momentum x', 'linear momentum y'))
     """
 
-    dimension: int
     controllable: tuple[str, ...]
     uncontrollable: tuple[str, ...]
-    rows: Array
-    basis: Array
-    fixed_poles: Values
     stabilizable: bool
     reach: dict[str, int]
-    method: str
-    margin: ranks.Margin
-    notes: tuple[str, ...]
-    robot: str
 
     def __str__(self) -> str:
-        nx = len(self.basis)
-        lines = [
-            f"{self.robot}: {self.dimension} of {nx} states are controllable ({self.method}); "
-            f"{'' if self.stabilizable else 'not '}stabilizable"
-        ]
+        lines = list[str]()
         if self.uncontrollable:
             lines.append(f"controllable: {', '.join(self.controllable)}")
             lines.append(f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}")
             placed = [f"{what} {count}" for what, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")
-        lines += [f"note: {note}" for note in self.notes]
-        return folded(lines)
+        decays = f"{'' if self.stabilizable else 'not '}stabilizable"
+        return self._summary("controllable", decays, lines)
 
 
 def controllability(lin: LinearModel) -> Controllability:

@@ -167,19 +167,16 @@ class Modes:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
-        undecided = tuple(
+        notes = [
             f"undecided: the mode at {mode.frequency:.4g} rad/s may grow or decay, because the "
             f"real part of its pole is only {mode.margin:.1g} times the rounding error"
             for mode in self.modes
             if 0.1 < abs(mode.margin) < 10.0
-        )
-        if not self.modes or self.modes[0].energy:
-            return undecided
-        return (
-            *undecided,
-            "the kinetic energies of the bodies are unknown, because the model was loaded from a "
-            "file",
-        )
+        ]
+        if self.modes and not self.modes[0].energy:
+            said = "the kinetic energies of the bodies are unknown, because the model was loaded "
+            notes.append(f"{said}from a file")
+        return tuple(notes)
 
     @property
     def poles(self) -> Complex:

@@ -6,10 +6,9 @@ import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.ranks import EPS, Margin, Noisy, echelon, without_rounding
+from fflin.analysis.ranks import EPS, Noisy, RankAnalysis, echelon, without_rounding
 from fflin.base.errors import InputError
-from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, Values, instance, positive
+from fflin.base.validation import Array, FrozenArrays, instance, positive
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
@@ -18,8 +17,8 @@ from fflin.linear.model import LinearModel
 _DECAY = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class Observability(FrozenArrays):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observability(RankAnalysis):
     """Observability of a linear model; ``print`` shows a summary.
 
     Attributes
@@ -52,26 +51,13 @@ class Observability(FrozenArrays):
     ('q_b.x', 'q_b.y', 'q_b.z')
     """
 
-    dimension: int
     unobservable: tuple[str, ...]
-    basis: Array
-    rows: Array
-    fixed_poles: Values
     detectable: bool
-    method: str
-    margin: Margin
-    notes: tuple[str, ...]
-    robot: str
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.robot}: {self.dimension} of {len(self.basis)} states are observable "
-            f"({self.method}); {'' if self.detectable else 'not '}detectable"
-        ]
-        if self.unobservable:
-            lines.append(f"unobservable: {', '.join(self.unobservable)}")
-        lines += [f"note: {note}" for note in self.notes]
-        return folded(lines)
+        lines = [f"unobservable: {', '.join(self.unobservable)}"] if self.unobservable else []
+        decays = f"{'' if self.detectable else 'not '}detectable"
+        return self._summary("observable", decays, lines)
 
 
 def observability(lin: LinearModel) -> Observability:

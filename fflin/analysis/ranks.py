@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array, Indices, Values
+from fflin.base.tables import folded
+from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
@@ -80,6 +82,26 @@ class FixedPoles(NamedTuple):
         """Return the poles, with the directions of the margins in transformed coordinates."""
         margin, settling = self.margin.transformed(change), self.settling.transformed(change)
         return self._replace(margin=margin, settling=settling)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RankAnalysis(FrozenArrays):
+    """Fields that `Controllability` and `Observability` share; see there."""
+
+    dimension: int
+    rows: Array
+    basis: Array
+    fixed_poles: Values
+    method: str
+    margin: Margin
+    notes: tuple[str, ...]
+    robot: str
+
+    def _summary(self, what: str, decays: str, lines: list[str]) -> str:
+        """Return the report: the dimension, then `lines`, then the notes."""
+        head = f"{self.robot}: {self.dimension} of {len(self.basis)} states are {what} "
+        notes = (f"note: {note}" for note in self.notes)
+        return folded([f"{head}({self.method}); {decays}", *lines, *notes])
 
 
 class Noisy(NamedTuple):

@@ -371,7 +371,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
         "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
-        "_drift": None if lin.drift is None else S @ lin.drift,
+        "drift": None if lin.drift is None else S @ lin.drift,
         "_inertia": partial(given, frozen(M)),
     }
 

@@ -53,9 +53,7 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 
 @contextmanager
-def drawing(
-    path: str | Path | None, width: float, height: float, compressed: bool = False
-) -> Iterator[Figure]:
+def drawing(path: str | Path | None, width: float, height: float) -> Iterator[Figure]:
     """Yield a figure of `width` x `height` [in] in fflin's style; save it if a path is given."""
     target = None if path is None else as_path(path)
     if target is not None:
@@ -65,9 +63,7 @@ def drawing(
 
     style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
     with matplotlib.rc_context(style):
-        figure = matplotlib.figure.Figure(
-            (width, height), layout="compressed" if compressed else "constrained"
-        )
+        figure = matplotlib.figure.Figure((width, height), layout="constrained")
         yield figure
         if target is not None:
             content = io.BytesIO()

@@ -149,7 +149,6 @@ def _lines_of(text: str) -> dict[str, int]:
             first, _, below = name.partition(".")
             if brackets == "[[":
                 counts[name] = counts.get(name, -1) + 1
-                lines.setdefault(name, number)
                 name = f"{name}.{counts[name]}"
             elif first in counts and below:  # a subtable of the last table of an array
                 name = f"{first}.{counts[first]}.{below}"

@@ -305,17 +305,17 @@ class LinearBatch(validation.Result):
         common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # The row is copied from a file into memory, so that the model does not keep the file open.
-        rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
-        lower, root = rows.pop("B_lower"), rows.pop("_root")
+        arrays = self._arrays().items()
+        rows = {key.removeprefix("_"): np.asarray(array[index]) for key, array in arrays}
+        lower, root = rows.pop("B_lower"), rows.pop("root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
-        at_rest = self._x0 is None  # x0 then follows from q
-        rows["x0"] = self._states_at_rest(rows["q"][None])[0] if at_rest else rows.pop("_x0")
-        rows["y0"] = rows.pop("_y0", rows["x0"])
-        if self._reference is None:
-            rows["_reference"] = base = rows["q"][:7]
-            if (root != AT_ROOT).any():
-                placed = pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)
-                rows["_reference"] = frozen(pin.SE3ToXYZQUAT(placed))
+        if self._x0 is None:  # x0 then follows from q
+            rows["x0"] = self._states_at_rest(rows["q"][None])[0]
+        rows.setdefault("y0", rows["x0"])
+        rows["placement"] = base = rows.pop("reference", rows["q"][:7])
+        if self._reference is None and (root != AT_ROOT).any():
+            placed = pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)
+            rows["placement"] = frozen(pin.SE3ToXYZQUAT(placed))
         return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:

@@ -31,8 +31,8 @@ from fflin.commands.builders import (
     reference_of,
     refuse,
     robot_of_design,
-    schedule_of,
     state_of,
+    weights_of,
 )
 
 if TYPE_CHECKING:
@@ -82,7 +82,8 @@ def tvlqr(arguments: Namespace) -> Report:
     why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
-    schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
+    Qf = once("--qf", arguments.qf) or "steady"
+    schedule = fflin.tvlqr(along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments))
     text = str(schedule)
     if any(isinstance(each, fflin.Thruster) for each in along.robot.inputs):
         text += f"\n{folded([_NOT_ALLOCATED])}"

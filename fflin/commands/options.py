@@ -14,6 +14,7 @@ _SCENE = "scene tool follow"
 _PICTURES = f"png gif times {_SCENE} fps speed"
 
 _AT_POINT = {"": "ROBOT", POINT: f"{_POSE} {_INPUTS} frame reference", ROBOT: _SYSTEM}
+_ALONG = {"": "ROBOT", ROBOT: _SYSTEM, TRAJECTORY: f"frame {_TRAJECTORY}"}
 _LOOP = {
     "": "ROBOT",
     "start": f"{_POSE} offset",
@@ -57,21 +58,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         OUTPUT: "plot",
     },
     "funnel": {
-        "": "ROBOT",
-        ROBOT: _SYSTEM,
-        TRAJECTORY: f"frame {_TRAJECTORY}",
+        **_ALONG,
         CONTROLLER: f"{_WEIGHTS} schedule",
         "runs": "goal within limits limit knots samples seed confidence threads dt step",
         OUTPUT: "plot output-file",
     },
     "lqr": {**_AT_POINT, CONTROLLER: f"{_WEIGHTS} dt allocate", OUTPUT: "output-file plot"},
-    "tvlqr": {
-        "": "ROBOT",
-        ROBOT: _SYSTEM,
-        TRAJECTORY: f"frame {_TRAJECTORY}",
-        CONTROLLER: f"{_WEIGHTS} dt qf",
-        OUTPUT: "output-file",
-    },
+    "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
     "plan": {
         "": "ROBOT",
         ROBOT: _SYSTEM,

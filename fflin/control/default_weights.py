@@ -52,14 +52,9 @@ _AS_SLOW = 0.9
 _NOT_ENOUGH = "is too small for all displacements"
 
 
-class Weights(NamedTuple):
-    """Weights Q (nx, nx) and R (nu, nu), with their rule and the bandwidth of the loop."""
-
-    Q: Array
-    R: Array
-    rule: str
-    bandwidth: float
-    terms: Array  # costs of the largest states and inputs (nx + nu,)
+# Weights Q (nx, nx) and R (nu, nu), their rule, the bandwidth of the loop, and the costs (nx + nu,)
+# of the largest states and inputs.
+Weights: TypeAlias = tuple[Array, Array, str, float, Array]
 
 
 class Pace(NamedTuple):
@@ -67,7 +62,7 @@ class Pace(NamedTuple):
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0  # factor on the design displacements
-    hold: float = 0.0  # [s], hold time of the inputs of a continuous model
+    hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
     held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
@@ -90,11 +85,11 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
         )
     damping, w = _damping(lin), pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
-        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta)
-        w, before = found.bandwidth, w
-        if _NOT_ENOUGH in found.rule or w > 0.97 * before:
+        before, M = w, lin.M + damping / w
+        Q, R, rule, w, terms = _of_inertia(lin, M, np.linalg.inv(N), pace, momenta)
+        if _NOT_ENOUGH in rule or w > 0.97 * before:
             break
-    return found
+    return Q, R, rule, w, terms
 
 
 def _damping(lin: LinearModel) -> Array:
@@ -162,8 +157,8 @@ def _of_inertia(
     if loaded:
         growth, mode = _growth(lin)
         limit = max(limit, (_OF_GROWTH * growth, mode))
-    if hold := pace.hold or lin.dt:
-        limit = min(limit, (float(pace.held / (hold * rates[-1])), "the sampling time"))
+    if pace.hold:
+        limit = min(limit, (float(pace.held / (pace.hold * rates[-1])), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -181,7 +176,7 @@ def _of_inertia(
         "; joint damping is included" if damped else ""
     )
     terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
-    return Weights(*costs(limit[0]), rule, limit[0], terms)
+    return *costs(limit[0]), rule, limit[0], terms
 
 
 def _on_velocities(

@@ -244,7 +244,7 @@ def make_gain(
     solution: Solution,
     Q: Array,
     R: Array,
-    N: Array | None,
+    N: Array,
     weights: str = "as given",
 ) -> Gain:
     """Return a model's gain from the Riccati solution of a `part`; other states get zero gain."""
@@ -256,7 +256,7 @@ def make_gain(
         P=S.T @ solution.P @ S,
         Q=S.T @ Q @ S,
         R=R,
-        N=np.zeros(lin.B.shape) if N is None else S.T @ N,
+        N=S.T @ N,
         weights=weights,
         regulated=part.state_names,
         _lin=lin,

@@ -142,18 +142,14 @@ def plan(
     shooting = Shooting(robot, t, hold == "previous")
     acting = chosen_limits(robot, limits)[0]
     low, high = input_limits(robot, acting)
-    if (low > high).any():
-        raise InputError("the lower limit of an input is above its upper limit; correct limits=")
-    if R is None:
-        size = np.maximum(np.abs(low), np.abs(high))
-        weights: Array = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
-    else:
-        matrix = weight("R", R, input_keys(actuation), definite=True)
-        weights = matrix.diagonal()
-        if (matrix != np.diag(weights)).any():
-            raise InputError(
-                "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
-            )
+    size = np.maximum(np.abs(low), np.abs(high))
+    by_limits = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
+    matrix = weight("R", by_limits if R is None else R, input_keys(actuation), definite=True)
+    weights = matrix.diagonal()
+    if (matrix != np.diag(weights)).any():
+        raise InputError(
+            "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
+        )
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T

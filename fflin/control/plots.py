@@ -56,7 +56,8 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     nx, nu = lin.B.shape
     cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
     size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
-    with drawing(path, *size, compressed=True) as figure:
+    with drawing(path, *size) as figure:
+        figure.set_layout_engine("compressed")
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
@@ -331,8 +332,8 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
         turned = changes(np.imag, i, values[:, i].real < 0.0)
         turned += [value[i] for value in ends if value[i].real < 0.0]
-        angles = [math.degrees(np.angle(value)) - 180.0 for value in crossed]
-        phase = min((abs(math.remainder(x, 360.0)) for x in angles), default=math.inf)
+        phases = [180.0 - abs(math.degrees(np.angle(value))) for value in crossed]
+        phase = min(phases, default=math.inf)
         factors = [1.0 / abs(value) if value else math.inf for value in turned]
         low = max((x for x in factors if _NOTHING < x < 1.0), default=0.0)
         high = min((x for x in factors if x > 1.0), default=math.inf)

@@ -15,15 +15,18 @@ from fflin.analysis.reduction import (
     selection,
     without,
 )
-from fflin.base.errors import InputError, listed, unknown
+from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
-from fflin.base.validation import Array, dimension, instance, number, positive, shaped, vector
+from fflin.base.validation import Array, dimension, instance, number, numbers, positive, shaped
 from fflin.control.default_weights import Pace, default_weights
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
+
+# Rule for the weights: its name, or a mapping with the keys of `weights` in `Robot.replace`.
+Rule: TypeAlias = str | Mapping[str, object]
 
 # A weight from the user, its name or pattern, and whether it was given as a largest value (Bryson).
 _Given: TypeAlias = tuple[float, str, bool]
@@ -91,11 +94,8 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
         )
     of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
-    values = {
-        name: inverse_square(what, number(what, value))
-        for name, value in largest.items()
-        if (what := f"largest value of '{name}'")
-    }
+    sizes = numbers("largest", largest, "name", "largest value of")
+    values = {key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()}
     return _diagonal("largest", values, names, complete=of_inputs)
 
 
@@ -114,8 +114,8 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     elif (indices := dimension(what, value)) == 0:
         matrix = number(what, value) * np.eye(size)
     elif indices == 1:
-        expected = f"one weight for each of {names[0]} to {names[-1]}"
-        matrix = np.diag(vector(what, value, size, expected))
+        hint = f": one weight for each of {names[0]} to {names[-1]}"
+        matrix = np.diag(shaped(what, value, (size,), hint))
     else:
         matrix, rounding = shaped(what, value, (size, size)), _ROUNDING
         skew = np.abs(matrix - matrix.T)
@@ -153,15 +153,14 @@ def require_semidefinite(
 
 def cost_weights(
     of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
-) -> tuple[Array, Array, Array | None]:
-    """Return the checked weights as matrices."""
+) -> tuple[Array, Array, Array]:
+    """Return the checked weights as matrices; N is zero by default."""
     Q = weight("Q", Q, of.state_names)
     R = weight("R", R, input_keys(of), definite=True)
-    if N is None:
-        return Q, R, None
-    cross = shaped("N", N, (len(Q), len(R)))
-    reduced = Q - cross @ np.linalg.solve(R, cross.T)
-    require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
+    cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
+    if cross.any():
+        reduced = Q - cross @ np.linalg.solve(R, cross.T)
+        require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
     return Q, R, cross
 
 
@@ -229,7 +228,7 @@ def sampled_cost(
         )
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
-    nx, cross = len(Q), np.zeros(lin.B.shape) if cross is None else cross
+    nx = len(Q)
     W = np.block([[Q, cross], [cross.T, R]])
     F = np.zeros_like(W)
     F[:nx] = np.hstack((lin.A, lin.B))
@@ -242,7 +241,7 @@ def sampled_cost(
 def _diagonal(
     what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
 ) -> Array:
-    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
+    checked = numbers(what, values, "name", "weight of")
     found = by_name(f"entry of {what}", checked, names)
     if complete and len(found) < len(names):
         missing = next(name for index, name in enumerate(names) if index not in found)
@@ -253,39 +252,25 @@ def _diagonal(
 
 
 def rule_weights(
-    lin: LinearModel,
-    name: str | None,
-    given: Mapping[str, Mapping[str, float]] | None = None,
-    *,
-    wheel_speeds: bool | None = None,
-    pace: Pace | None = None,
+    lin: LinearModel, given: Rule | None, pace: Pace, wheel_speeds: bool | None = None
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N by a rule, and a description of the rule.
-
-    `given` weights replace weights of the rule.
-    """
+    """Return Q, R and N by a rule with given weights, and a description of the rule."""
     # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
     # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
     # the rule; if they do not, it is "urdf".
-    source = lin.generator or lin
-    layers = [(given, False)] if given else []
-    if name is None and lin.weights:
-        layers.insert(0, (lin.weights, True))
-        name = lin.weights.get("rule")
+    source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
+    require_known("part of weights", given, ("rule", "q", "r", "bryson"))
+    own = lin.weights if given.get("rule") is None else {}
+    name = own.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(lin.B.shape))
     if name is None or name == "urdf":
-        pace = pace or Pace()
-        pace = pace._replace(hold=lin.dt or pace.hold)
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "1 for every state and every input (identity)"
     else:
-        raise unknown("rule of weights", name, ("urdf", "identity"))
-    weights = dict[int, _Given]()
-    for layer, of_robot in layers:
-        weights |= _weights_of(lin, layer, of_robot)
-    if weights:
+        raise unknown("rule of weights", str(name), ("urdf", "identity"))
+    if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
         # A common factor of Q and R does not change the gain. The rule's weights are scaled so that
         # the largest values of the named states and inputs cost 1, as in Bryson's rule.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
@@ -340,7 +325,7 @@ def _of_regulated(
 
 
 def _weights_of(
-    lin: LinearModel, given: Mapping[str, Mapping[str, float]], of_robot: bool
+    lin: LinearModel, given: Mapping[str, object], *, of_robot: bool = False
 ) -> dict[int, _Given]:
     """Return the given weights by index; the indices of inputs follow the indices of states."""
     states, inputs = lin.state_names, input_keys(lin)
@@ -348,13 +333,11 @@ def _weights_of(
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
     for part, kind, known in kinds:
         values = dict[str, _Given]()
-        for key, raw in given.get(part, {}).items():
+        for key, value in numbers(part, given.get(part, {}), "name", f"{part} of").items():
             if of_robot and not stands_for_any(key, known):
                 continue  # a reduced model may lack states that the robot's weights name
-            value = number(f"{part} of '{key}'", raw)
-            if part == "bryson":
-                value = inverse_square(f"largest value of '{key}' (--bryson)", value)
-            values[key] = value, key, part == "bryson"
+            what, largest = f"largest value of '{key}' (--bryson)", part == "bryson"
+            values[key] = inverse_square(what, value) if largest else value, key, largest
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}
         if both := found.keys() & at.keys():

@@ -1,6 +1,7 @@
 """Inertia M and M^-1, accelerations, and their derivatives by RNEA."""
 
 import warnings
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +54,7 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        slides = [joint for joint in robot.joints if joint.prismatic and joint.kind != "modal"]
-        self._slides = [joint.idx_q for joint in slides]
+        self._slides = [*map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))]
         # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
         # works in world axes, and would lose digits if the base were far away.
         self._still = pin.neutral(robot.model)

@@ -281,7 +281,7 @@ class StateMap:
         chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ turning.product_matrix(turning.conjugate(self.origin_quaternion)).T
+        turned = relative @ turning.product_matrix(self.origin_quaternion)
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles * self._scale[6:]
@@ -379,7 +379,9 @@ class Actuation:
         self.state, self._model = state, robot.model
         names: list[str] = []
         units: list[str] = []
-        groups: list[str] = []
+        # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
+        # the order in which they first appear.
+        self.groups: dict[str, list[int]] = {}
         columns: list[Array] = []
         held: list[slice] = []
         # Thrusters and wheels without a joint of their own. {joint on which they are mounted:
@@ -394,7 +396,7 @@ class Actuation:
                 if rows in state.in_reference:
                     held.append(slice(at, at + 3))
             elif isinstance(item, kinds.JointTorque):
-                index = robot.joints.index(robot.joint(item.joint))
+                index = robot.joint_names.index(item.joint)
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:
@@ -407,17 +409,13 @@ class Actuation:
                 columns.append(np.zeros(nv))
             names += own
             units += [unit] * len(own)
-            groups += [item.GROUP] * len(own)
+            self.groups.setdefault(item.GROUP, []).extend(range(at, len(columns)))
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")
         # In linear models, the same attributes have the names `input_names` and `input_units`.
         self.names = self.input_names = tuple(names)
         self.units = self.input_units = tuple(units)
-        # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
-        # the order in which they first appear.
-        kind = np.array(groups)
-        self.groups = {group: np.flatnonzero(kind == group) for group in dict.fromkeys(groups)}
         # Slices of three inputs that form a torque or force on the base in reference axes.
         self.held = tuple(held)
         # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose

@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -86,7 +86,7 @@ def kernel(module: str, name: str) -> Compiled:
 def _prepared(module: str, name: str) -> Compiled:
     from fflin.kernel.machine_code import translated
 
-    compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name))
+    compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name), "compiled")
     compile, folder = compiled.compile, Path(str(compiled.stats.cache_path))
     lock = folder / f"{module}.{name}.lock"
     with _between_processes(lock):
@@ -130,20 +130,19 @@ def _seconds_shown(what: str) -> Iterator[None]:
         bar.close()
 
 
-@contextmanager
-def _between_processes(path: Path) -> Iterator[None]:
-    """Hold the file lock of a function's machine code; the system frees it if the process dies.
+def _between_processes(path: Path) -> ExitStack:
+    """Hold the file lock of a function's machine code until the returned context ends.
 
-    There is no lock if the package filelock is missing, if the folder is not writable, or after a
-    long wait. At worst, two processes then compile the same function.
+    The system frees the lock if the process dies. There is no lock if the package filelock is
+    missing, if the folder is not writable, or after a long wait. At worst, two processes then
+    compile the same function.
     """
-    try:
+    held = ExitStack()
+    # An OSError may be the `Timeout` of the second wait.
+    with suppress(ImportError, OSError, NotImplementedError):
         from filelock import FileLock, Timeout
-    except ImportError:
-        yield
-        return
-    lock = FileLock(path)
-    with suppress(OSError, NotImplementedError):  # includes the `Timeout` of the second wait
+
+        lock = FileLock(path)
         try:
             lock.acquire(timeout=_SILENCE)
         except Timeout:
@@ -151,10 +150,8 @@ def _between_processes(path: Path) -> Iterator[None]:
                 "fflin: waiting for another process that compiles the code in %s", path.parent
             )
             lock.acquire(timeout=_LONGEST_WAIT)
-    try:
-        yield
-    finally:
-        lock.release()
+        held.callback(lock.release)
+    return held
 
 
 def is_kept(module: str, name: str) -> bool:

@@ -35,7 +35,7 @@ from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
-from fflin.kernel.vectors import compiled, load, splat, store
+from fflin.kernel.vectors import load, splat, store
 
 
 def _coriolis(work, at, w):
@@ -165,7 +165,6 @@ def _unpack(work, start, entries, out, first, offset):
             out[first + lane, offset + entry] = work[start + entry, lane]
 
 
-@compiled
 def derive(tree, points, out, lanes, work):
     """Write the results of `RowAccelerations` at eight or more points; `nu` is empty at rest."""
     q, nu, force, u = points

@@ -15,7 +15,7 @@ from fflin.kernel.allocation import allocate
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import angle, below, chosen, compiled, load, root, store, whole
+from fflin.kernel.vectors import angle, below, chosen, load, root, store, whole
 
 
 class Wheels(
@@ -230,7 +230,6 @@ def _move(robot, method, point, stage):
         vec.displace(robot.tree, point.q, along, point.q)
 
 
-@compiled
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs to the step `last`, or until a stop condition is met.
 
@@ -347,7 +346,6 @@ def _compare(stats, step):
     store(sizes, 0, half * (360.0 / np.pi))
 
 
-@compiled
 def take(words, rows, first, count):
     """Update the statistics with `count` rows of `advance`, which begin at the step `first`.
 

@@ -57,11 +57,8 @@ Typer: TypeAlias = Callable[..., Signature]
 class Lanes(Type):
     """numba type of eight doubles in one vector."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
 
-
-lanes = Lanes()
+lanes = Lanes("Lanes")
 
 
 extending.register_model(Lanes)(partial(extending.models.PrimitiveModel, be_type=_VECTOR))
@@ -108,9 +105,6 @@ _arithmetic(operator.mul, ir.IRBuilder.fmul)
 _arithmetic(operator.truediv, ir.IRBuilder.fdiv)
 _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 
-# {function of `kernel.vectors`: operation that replaces it in compiled code}.
-OPERATIONS: dict[Callable[..., object], Callable[..., object]] = {}
-
 
 def _operation(
     replaced: Callable[..., object], typed: Typer
@@ -141,7 +135,7 @@ def _operation(
 
             return typed(*kinds), generated
 
-        OPERATIONS[replaced] = operation
+        uncompiled.IN_PLACE[replaced] = operation
         return generate
 
     return decorated
@@ -395,8 +389,11 @@ class Compiled(Protocol):
 
 
 @cache
-def translated(function: FunctionType) -> Compiled:
-    """Convert a function of the kernel, and the functions that it calls, to numba functions."""
+def translated(function: FunctionType, how: str = "") -> Compiled:
+    """Convert a function of the kernel, and the functions that it calls, to numba functions.
+
+    `how` is "compiled" for a function that Python calls; its machine code is stored on disk.
+    """
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:
         if name in names:
@@ -404,7 +401,7 @@ def translated(function: FunctionType) -> Compiled:
     twin = FunctionType(
         function.__code__, names, function.__name__, function.__defaults__, function.__closure__
     )
-    return _DECORATORS[uncompiled.HOW.get(function, "inlined")](twin)
+    return _DECORATORS[how or ("called" if function in uncompiled.CALLED else "inlined")](twin)
 
 
 def _counterpart(value: object) -> object:
@@ -414,7 +411,7 @@ def _counterpart(value: object) -> object:
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):
         return _translated_module(value)
     if callable(value):
-        value = OPERATIONS.get(value, uncompiled.LOOPS.get(value, value))
+        value = uncompiled.IN_PLACE.get(value, value)
     return translated(value) if isinstance(value, FunctionType) else value
 
 

@@ -29,21 +29,15 @@ Number: TypeAlias = float
 # Numbers in memory. The entries of a list are read faster than the entries of an array.
 Entries: TypeAlias = Array | list[Number]
 
-# {function of the kernel: how it is compiled}. All other functions are inlined in their callers.
-HOW: dict[Callable[..., object], str] = {}
-# {function that uses NumPy: loop that is compiled in its place}.
-LOOPS: dict[Callable[..., object], Callable[..., object]] = {}
+# Functions of the kernel that are called. All other functions are inlined in their callers.
+CALLED: set[Callable[..., object]] = set()
+# {function: function or operation that compiled code uses in its place}.
+IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
     """Mark a rarely called function: it is not inlined, which saves compilation time."""
-    HOW[function] = "called"
-    return function
-
-
-def compiled(function: F) -> F:
-    """Decorate a function that Python calls; its machine code is stored on disk."""
-    HOW[function] = "compiled"
+    CALLED.add(function)
     return function
 
 
@@ -51,7 +45,7 @@ def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
     """Decorate a function that uses NumPy; compiled code calls a loop in its place."""
 
     def noted(function: F) -> F:
-        LOOPS[function] = called(loop)
+        IN_PLACE[function] = called(loop)
         return function
 
     return noted

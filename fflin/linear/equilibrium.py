@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
-from fflin.base.tables import grid
+from fflin.base.tables import grid, signals
 from fflin.base.validation import Array, Complex, FrozenArrays, Indices, Mask, instance
 from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
@@ -70,8 +70,6 @@ class Equilibrium(FrozenArrays):
     force_units: tuple[str, ...]
 
     def __str__(self) -> str:
-        from fflin.base.tables import signals
-
         said = "u: all zero"
         if self.u.any():
             said = signals("u", self.u, self.input_names, self.input_units)
@@ -445,6 +443,7 @@ def relative_equilibria(
             "axis"
         )
     n, found, field = mean_motion(robot), [], OrbitField(robot, frame_of(robot, frame))
+    rounding = _ROUNDING * (sizes[2] / sizes[0]) ** 2
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs
         if np.linalg.det(own) < 0.0:
@@ -452,23 +451,17 @@ def relative_equilibria(
         R = field.axes @ own.T
         at, moments = q.copy(), sizes[list(order)]
         at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
-        poles, margin = _libration(moments, n)
+        radial, along, normal = moments.tolist()
+        pitch = 3.0 * (along - radial) / normal
+        k_a, k_r = (normal - radial) / along, (normal - along) / radial
+        b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
+        # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
+        apart = np.sqrt(complex(b * b - 4.0 * c))
+        larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
+        squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
+        roots = n * np.sqrt(squares)
+        poles = np.column_stack((roots, -roots)).ravel()
+        margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
         found.append(RelativeEquilibrium(at, moments, poles, stable, margin))
     return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
-
-
-def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of the attitude motion, and its stability margin in rounding errors."""
-    radial, along, normal = moments.tolist()
-    pitch = 3.0 * (along - radial) / normal
-    k_a, k_r = (normal - radial) / along, (normal - along) / radial
-    b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
-    # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
-    root = np.sqrt(complex(b * b - 4.0 * c))
-    larger = -0.5 * (b + (root if b >= 0.0 else -root))
-    squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
-    roots = n * np.sqrt(squares)
-    poles = np.column_stack((roots, -roots)).ravel()
-    rounding = _ROUNDING * (max(moments) / min(moments)) ** 2
-    return poles, float(min(pitch, c, b, b * b - 4.0 * c) / rounding)

@@ -129,11 +129,12 @@ class LinearTrajectory(Trajectory):
             return tuple(each[k] for each in arrays)
         return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
 
-    def check(self) -> Check:
+    def check(self, *, tolerance: float | None = None) -> Check:
         """Check the linear model at every knot by `fflin.check`, and return the largest errors."""
         from fflin.linear.check import check_all
 
-        return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
+        title = f"{self.robot.name}, {len(self)} knots"
+        return check_all(self.robot, self, title, tolerance=tolerance)
 
     @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:

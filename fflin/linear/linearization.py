@@ -260,15 +260,15 @@ class Linearizer:
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        self._rate = "_drift" if ready.moving else "f0"
+        self._rate = "drift" if ready.moving else "f0"
         # Fields of a model at rest, except B and q. Expensive fields are computed at their first
         # use.
         slow = {"x0": ready.state_at, "y0": ready.state_at}
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
-            slow["_reference"] = partial(own_reference, robot)
+            slow["placement"] = partial(own_reference, robot)
         else:
-            self._fields["_reference"] = ready.reference
+            self._fields["placement"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Whether only B must be computed for a model at rest. This requires default inputs, outputs

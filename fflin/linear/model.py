@@ -117,6 +117,12 @@ class LinearModel(StateSpace):
     moving : bool
         Whether the state is the error relative to a reference that moves through the operating
         point.
+    placement : ndarray (7,)
+        The placement `reference`: position [m] and quaternion x, y, z, w.
+    drift : ndarray (nx,) or None
+        State derivative of a moving reference, or None if the reference is fixed. The attitude rate
+        excludes rotation about the direction of gravity, because this rotation does not affect the
+        dynamics. If the reference moves, f0 is zero.
     q : ndarray (nq,)
         Configuration at the operating point in Pinocchio's order.
     v : ndarray (nv,)
@@ -158,11 +164,11 @@ class LinearModel(StateSpace):
     locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
-    _reference: Array = field()
+    placement: Array
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
-    _drift: Array | None = None
+    drift: Array | None = None
     # For a model that was made from another model: its fingerprint, and the other model. The other
     # model has the certificate. Its matrices also have exact zeros, which are lost by the matrix
     # exponential of a discretisation.
@@ -196,20 +202,6 @@ class LinearModel(StateSpace):
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self.placement)
-
-    @property
-    def placement(self) -> Array:
-        """The placement `reference` as an array (7,): position [m] and quaternion x, y, z, w."""
-        return self._reference
-
-    @property
-    def drift(self) -> Array | None:
-        """State derivative (nx,) of a moving reference, or None if the reference is fixed.
-
-        The attitude rate excludes rotation about the direction of gravity, because this rotation
-        does not affect the dynamics. If the reference moves, f0 is zero.
-        """
-        return self._drift
 
     @cached_property
     def M(self) -> Array:

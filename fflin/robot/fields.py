@@ -130,25 +130,23 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
 def _weights(value: object, robot: Robot) -> dict[str, object]:
     """Check the weights of a robot's regulator, whose keys name states and inputs."""
     states, inputs = state_keys(robot.joint_names), _input_keys(robot)
-    kinds = {"q": states, "r": inputs, "bryson": (*states, *inputs)}
+    both = (*states, *inputs)
+    kinds = {"q": ("state", states), "r": ("input", inputs), "bryson": ("state or input", both)}
     given = _parts("weights", value, ("rule", *kinds))
-    weights: dict[str, object] = {}
-    if "rule" in given:
-        require_known("rule of weights", [str(given["rule"])], RULES)
-        weights["rule"] = given["rule"]
-    weighed, bounded = set[str](), set[str]()
-    for part, names in kinds.items():
-        entries = numbers(part, given.get(part, {}), "name", f"{part} of")
-        for key, entry in entries.items():
-            matching({"q": "state", "r": "input"}.get(part, "state or input"), key, names)
+    require_known("rule of weights", [str(given.get("rule", RULES[0]))], RULES)
+    weights: dict[str, dict[str, float]] = {}
+    for part, (kind, names) in kinds.items():
+        weights[part] = numbers(part, given.get(part, {}), "name", f"{part} of")
+        for key, entry in weights[part].items():
+            matching(kind, key, names)
             if entry < 0.0 or (part != "q" and not entry):
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
-        (bounded if part == "bryson" else weighed).update(entries)
-        weights |= {part: entries} if entries else {}
-    for key in weighed & bounded:
-        raise InputError(f"'{key}' has both a weight and a largest value; give only one of them")
-    return weights
+            if part == "bryson" and (key in weights["q"] or key in weights["r"]):
+                said = f"'{key}' has both a weight and a largest value; give only one of them"
+                raise InputError(said)
+    rule = {"rule": given["rule"]} if "rule" in given else {}
+    return rule | {part: entries for part, entries in weights.items() if entries}
 
 
 def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
@@ -208,10 +206,16 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
     """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
-    low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in inputs]).T
+    low, high = np.array([limits.get(name, _OPEN) for name in inputs]).T
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
     for index, (_, item) in pulsed_thrusters(robot).items():
         high[index] = min(high[index], item.max or math.inf)
+    for name, least, largest in zip(inputs, low.tolist(), high.tolist(), strict=True):
+        if least > largest:
+            raise InputError(
+                f"the lower limit of {name} is {least:g}, above its upper limit {largest:g}; "
+                "correct limits= or the limits of the input"
+            )
     return low, high
 
 

@@ -277,24 +277,16 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
 
     Changed limits and new frames are ignored.
     """
-    parts = {
-        "names": lambda x: x.names,
-        "parents": lambda x: x.parents,
-        "axis": lambda x: x.joints,
-        "placement": lambda x: x.jointPlacements,
-        "inertia": lambda x: x.inertias,
-        "armature": lambda x: x.armature,
-        "gravity": lambda x: x.gravity.vector,
-        "frames": lambda x: list(x.frames)[: made.nframes],
-    }
-    for what, of in parts.items():
-        now, before = (list(of(each)) for each in (model, made))
+    of_joints = {"joints": "axis", "jointPlacements": "placement", "inertias": "inertia"}
+    for name in ("names", "parents", *of_joints, "armature", "frames"):
+        now, before = list(getattr(model, name)), list(getattr(made, name))
+        now = now[: len(before)] if name == "frames" else now
         if now != before:
             at = next((i for i, x in enumerate(before) if now[i : i + 1] != [x]), 0)
-            if what in ("axis", "placement", "inertia"):
-                return f"the {what} of joint '{made.names[at]}'"
-            return f"the frame '{made.frames[at].name}'" if what == "frames" else f"its {what}"
-    return ""
+            if name in of_joints:
+                return f"the {of_joints[name]} of joint '{made.names[at]}'"
+            return f"the frame '{made.frames[at].name}'" if name == "frames" else f"its {name}"
+    return "" if model.gravity == made.gravity else "its gravity"
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:

@@ -103,14 +103,12 @@ def load(
     >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
     8
     """
-    found, dirs, locks = (
-        find_robot(robot),
-        folders(package_dirs),
-        requested(() if lock is None else lock),
-    )
+    found, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
     document, later, of_file = None, dict[str, float | None](), dict[str, object]()
     if found.path.suffix.lower() == ".toml":
-        document, found, own, of_file = _read_robot_file(found)
+        document, found, of_file = _read_robot_file(found)
+        with document.located("lock"):
+            own = requested(of_file.pop("lock", ()))
         later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
     urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path)
     with document.located("lock") if document else nullcontext():
@@ -126,7 +124,7 @@ def load(
         notes=urdf.notes,
         package_dirs=dirs,
         links={
-            name: LinkMass(link.mass, link.tensor, link.com.placement)
+            name: LinkMass(link.mass, link.inertia, link.com.placement)
             for name, link in urdf.links.items()
             if link.mass
         },
@@ -203,7 +201,7 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     _check_model(copy, name)
-    robot = _robot(copy, name, requested(() if lock is None else lock), {})
+    robot = _robot(copy, name, requested(lock), {})
     return robot.replace(**fields) if fields else robot
 
 
@@ -354,10 +352,8 @@ def _document(path: Path) -> TomlFile:
     return document
 
 
-def _read_robot_file(
-    file: RobotFile,
-) -> tuple[TomlFile, RobotFile, dict[str, float | None], dict[str, object]]:
-    """Read a robot file; return it, its URDF, its locks, and its fields in `FIELDS` order."""
+def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, object]]:
+    """Read a robot file; return it, its URDF, and its locks and fields, in `FIELDS` order."""
     document = _document(file.path)
     record, folder = document.record, file.path.parent
     if "urdf" not in record:
@@ -378,8 +374,6 @@ def _read_robot_file(
         else flat(value)
         for key, value in record.items()
     }
-    with document.located("lock"):
-        lock = requested(values.get("lock", ()))
     if "input" in record:
         values["inputs"] = _read_inputs(document)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
@@ -388,7 +382,7 @@ def _read_robot_file(
         values["appendages"] = appendages
     # The robot has the name of the TOML file, not of the URDF.
     found = found._replace(name=file.name, package_dirs=dirs)
-    return document, found, lock, {key: values[key] for key in FIELDS if key in values}
+    return document, found, {key: values[key] for key in ("lock", *FIELDS) if key in values}
 
 
 def _read_inputs(document: TomlFile) -> tuple[Input, ...]:

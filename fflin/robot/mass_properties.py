@@ -194,8 +194,6 @@ def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
         difference = np.abs(total.matrix() - body.matrix()).max()
         if difference <= _ROUNDING * np.abs(body.matrix()).max():
             found |= named
-        elif len(named) == 1:
-            found |= dict.fromkeys(named, whole)
         own = "base" if joint == ROOT else model.names[joint]
         alone = next(iter(named)) if len(named) == 1 else own
         also |= {own: alone} if alone != own else {}

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from string import Template
 from textwrap import fill
 
@@ -118,8 +119,6 @@ def _indented(text: str, below: str) -> str:
 
 def draft(robot: Robot, urdf: str) -> str:
     """Return the draft of a robot file for a robot from a URDF; `urdf` is the path to write."""
-    from importlib.resources import files
-
     model = robot.model
     idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
     names = ", ".join(_text(joint.name) for joint in idle)
@@ -145,7 +144,7 @@ def draft(robot: Robot, urdf: str) -> str:
         "stiffness": {_text(name): f"{size * _SWING**2:.6g}" for name, size in inertia.items()},
         "limits": limits,
     }
-    template = Template(files("fflin.robot").joinpath("assets", "robot.toml").read_text("utf-8"))
+    template = Template((Path(__file__).parent / "assets" / "robot.toml").read_text("utf-8"))
     return template.substitute(
         {key: "".join(f"{k} = {x}\n" for k, x in of.items()) for key, of in tables.items()},
         name=_text(robot.name)[1:-1],

@@ -89,6 +89,7 @@ def locked_model(
 
 def requested(lock: object) -> dict[str, float | None]:
     """Return locks as {joint or pattern: value}; the value None means the neutral position."""
+    lock = () if lock is None else lock
     try:
         names: list[object] = [lock] if isinstance(lock, str) else [*cast("Iterable[object]", lock)]
     except TypeError:  # not iterable

@@ -28,6 +28,7 @@ from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
 
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
+OfOutputs: TypeAlias = LinearController | TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # With more steps, a single run uses the compiled loop, if its machine code is already stored.
 LONG = 20_000
@@ -146,11 +147,8 @@ class LaneLoop:
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width, self.done = int(self.ends[-1]), 0
-        self._of_run = {
-            **{"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay},
-            **robot.tree._asdict(),
-            **robot.faults._asdict(),
-        }
+        self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
+        self._of_run |= robot.tree._asdict() | robot.faults._asdict()
 
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
@@ -351,7 +349,6 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
     return law._replace(
-        kind=policies.NOTHING,
         turned=list(state.axes),
         origin=pin.SE3ToXYZQUAT(state.origin),
         near=np.zeros(state.robot.n),
@@ -373,7 +370,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     if asking is not plan.plant:
         law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))
     if isinstance(policy, LinearController | TrajectoryOutputFeedback):
-        law = _filtered(law, plan, policy, asking, mechanics)
+        law = _filtered(law, plan, policy, asking)
     elif isinstance(policy, TrajectoryFeedback):
         law = law._replace(kind=policies.TRACK, path=_path(law.path, plan, policy, asking.state))
     elif isinstance(policy, StateFeedback | Gridded):
@@ -401,13 +398,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def _filtered(
-    law: policies.Law,
-    plan: Plan,
-    policy: LinearController | TrajectoryOutputFeedback,
-    asking: Plant,
-    mechanics: forward.Mechanics,
-) -> policies.Law:
+def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -> policies.Law:
     """Return the law of a compensator; along a trajectory, it has matrices for each sample."""
     state, times, rows = asking.state, plan.times, 1
     loop = policy.bind(asking.robot)
@@ -422,7 +413,7 @@ def _filtered(
     }
     measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
-    axes = mechanics.tree.axes
+    axes = mechanics_of(plan.plant).tree.axes
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,

@@ -268,16 +268,11 @@ class Motion(Design):
         robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
         for part in parts[1:]:
             if isinstance(part, Impact):
-                name, (other, other_q, other_v) = part.event, part._before
+                name, (other, *first_row) = part.event, part._before
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")
-                name, other, other_q, other_v = (
-                    event or part.robot,
-                    part._robot,
-                    part.q[0],
-                    part.v[0],
-                )
-            seen, rates = _seen(robot, other, q, other_q[None], other_v[None])
+                name, other, first_row = event or part.robot, part._robot, [part.q[0], part.v[0]]
+            seen, rates = _seen(robot, other, q, *(each[None] for each in first_row))
             apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
             if apart.max() > _MET * max(1.0, np.abs(v).max()):
                 at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
@@ -387,11 +382,10 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     for held in Actuation(state).held:  # in reference axes
         u[:, held] = u[:, held] @ there.reference.rotation.T @ state.reference.rotation
     rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
-    for key in ("energy", "momentum", "momentum_drift", "com_drift"):
-        rows[key] = getattr(motion, key)
-    joined: dict[str, Any] = {
-        key: np.concatenate((getattr(whole, key), added)) for key, added in rows.items()
-    }
+    joined: dict[str, Any] = {}
+    for key in (*rows, "energy", "momentum", "momentum_drift", "com_drift"):
+        added = rows.get(key, getattr(motion, key))
+        joined[key] = np.concatenate((getattr(whole, key), added))
     return replace(
         whole,
         **joined,

@@ -20,7 +20,7 @@ from fflin.base.validation import Array, ArrayLike, instance, number, truth, vec
 from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
-from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
+from fflin.control.tracking import followed, largest_rate, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
@@ -89,8 +89,7 @@ class Times(NamedTuple):
     every: int  # steps between recorded rows
     sample: int  # steps between samples of the law; 0 if it is evaluated at all stages
     delay: int  # steps from a sample to its effect
-    fastest: float  # largest magnitude of the loop's poles [1/s]; 0 if unknown
-    thinned: bool  # whether `every` was chosen automatically
+    notes: tuple[str, ...]  # remarks on the recorded rows, for the report
 
     @property
     def rows(self) -> int:
@@ -101,18 +100,6 @@ class Times(NamedTuple):
     def slow(self) -> float:
         """Square of the largest angular velocity at which a step is accurate."""
         return float((LARGEST_TURN / self.dt) ** 2)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on the recorded rows, for the report."""
-        notes, every, sample = list[str](), self.every, self.sample
-        if self.thinned:
-            said = f"one in {every} steps is recorded; every=1 (--every 1) records all "
-            notes.append(f"{said}{self.steps:,} steps")
-        if sample and every % sample and sample % every:
-            said = f"a row is recorded every {every} steps, but the controller samples every "
-            notes.append(f"{said}{sample} steps, so the rows are not a valid trajectory")
-        return tuple(notes)
 
 
 class Plan:
@@ -127,20 +114,14 @@ class Plan:
         self.plant = plant = Plant(state, options.disturbance)
         self.policy: object = policy
         self.method = integrator(options.method)
-        if times.fastest * times.dt > self.method.reach:
-            raise InputError(
-                f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
-                f"{times.fastest:.4g} 1/s; take at most {self.method.reach / times.fastest:.2g} s, "
-                "or give `sample`"
-            )
-        follows, (lin, _) = reference_of(policy), feedback_of(policy)
+        along, (lin, _) = tracking_of(policy), feedback_of(policy)
+        follows = along.reference if along else None
         default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
         # Initial configuration (nq,) and velocity (nv,).
         self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
-        _require_room(times, state, chosen=options.dt is None)
         expected = "a list of functions event(t, q, v)"
         self.events = tuple(instance("events", options.events, Sequence, expected))
         functions: list[tuple[str, object, str]] = [("event", x, "(t, q, v)") for x in self.events]
@@ -268,19 +249,8 @@ def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
 
 def times_of(policy: object, options: SimulationOptions) -> Times:
     """Derive the times of a simulation from the options and the policy."""
-    duration, dt, every, sample = options.duration, options.dt, options.every, options.sample
-    follows = tracking_of(policy)
-    if sample is not None:
-        sample = _positive("sample", sample)
-    else:
-        by = decider(policy)
-        made = by if hasattr(by, "dt") else getattr(by, "lin", None)
-        sample = getattr(follows.schedule if follows else made, "dt", None) or None
-    fastest = 0.0
-    if not sample and follows:
-        fastest = largest_rate(follows.schedule)
-    elif not sample and (closed := closed_loop(policy)) and not closed[1]:
-        fastest = float(np.abs(np.linalg.eigvals(closed[0])).max())
+    duration, dt, every, follows = options.duration, options.dt, options.every, tracking_of(policy)
+    sample, fastest = _pace_of(policy, options.sample)
     if duration is None and follows is None:
         raise InputError("the duration is missing; give duration= in s")
     duration = _positive("duration", follows.duration if follows and duration is None else duration)
@@ -303,31 +273,54 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         dt = duration / steps
     if sample is None:
         sample = dt if delay else 0.0
+    reach = integrator(options.method).reach
+    if fastest * dt > reach:
+        raise InputError(
+            f"the step dt is {dt:g} s, too large for a loop whose fastest pole is at "
+            f"{fastest:.4g} 1/s; take at most {reach / fastest:.2g} s, or give `sample`"
+        )
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
-    thinned, part = every is None and steps > _MANY_ROWS, max(samples, 1)
+    thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
     # If the policy is sampled, record rows only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
-    return Times(dt, steps, every, samples, late, fastest, thinned)
-
-
-def _require_room(times: Times, state: StateMap, *, chosen: bool) -> None:
-    """Raise an error for too many rows or steps; warn if a `chosen` automatic step is small."""
-    dt, steps, rows, fastest = times.dt, times.steps, times.rows, times.fastest
-    width = state.robot.nq + state.robot.nv + 2 * state.nx
-    if rows * width > _MOST_ENTRIES or steps > (_ENDLESS if times.thinned else _MOST_STEPS):
+    if thinned:
+        said = f"one in {every} steps is recorded; every=1 (--every 1) records all "
+        notes.append(f"{said}{steps:,} steps")
+    if every % part and part % every:
+        said = f"a row is recorded every {every} steps, but the controller samples every "
+        notes.append(f"{said}{part} steps, so the rows are not a valid trajectory")
+    times = Times(dt, steps, every, samples, late, tuple(notes))
+    entries = times.rows * (options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n)
+    if entries > _MOST_ENTRIES or steps > (_ENDLESS if thinned else _MOST_STEPS):
         raise InputError(
-            f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {rows:.3g} rows, "
-            "which is too many; use a larger dt or `every`, or a slower gain if a fast pole of the "
-            "loop requires this step"
+            f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {times.rows:.3g} "
+            "rows, which is too many; use a larger dt or `every`, or a slower gain if a fast pole "
+            "of the loop requires this step"
         )
-    if chosen and fastest * _STEP > 1.0 and steps > _MANY_STEPS:
+    if options.dt is None and fastest * _STEP > 1.0 and steps > _MANY_STEPS:
         warnings.warn(
             f"the simulation takes long, because the fastest pole of the loop at {fastest:.3g} 1/s "
             f"requires {steps:,} steps of {dt:.3g} s; give dt=, sample= or a slower gain",
             FflinWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
+    return times
+
+
+def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
+    """Return a policy's sample time [s], or else None and the fastest pole of its loop [1/s]."""
+    follows, by = tracking_of(policy), decider(policy)
+    if sample is not None:
+        return _positive("sample", sample), 0.0
+    made = by if hasattr(by, "dt") else getattr(by, "lin", None)
+    if sample := getattr(follows.schedule if follows else made, "dt", None):
+        return sample, 0.0
+    if follows:
+        return None, largest_rate(follows.schedule)
+    if (closed := closed_loop(policy)) and not closed[1]:
+        return None, float(np.abs(np.linalg.eigvals(closed[0])).max())
+    return None, 0.0
 
 
 def _in_steps(name: str, time: float, dt: float) -> int:
@@ -343,11 +336,9 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 def _part_of(sample: float, largest: float, *times: float) -> float:
     """Return a time step that divides the sample time and, if possible, all other times."""
     least = int(np.ceil(sample / largest))
-    for parts in range(least, least + 1000):
-        dt = sample / parts
-        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
-            return dt
-    return sample / least
+    steps = [sample / parts for parts in range(least, least + 1000)]
+    fit = (dt for dt in steps if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times))
+    return next(fit, steps[0])
 
 
 def _positive(name: str, value: object) -> float:

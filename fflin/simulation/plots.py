@@ -187,8 +187,12 @@ def _draw(
 ) -> None:
     """Draw curves and their limits; references are pale, and predictions dashed."""
     group, unit = found[0].group, found[0].unit
-    if group == "q_b":
-        found = _with_gaps(found)
+    # Attitude curves have gaps at 180 degrees, where the quaternion changes its sign.
+    for field in ("values", "linear", "reference") if group == "q_b" else ():
+        if getattr(found[0], field) is not None:
+            rows = np.array([getattr(each, field) for each in found])
+            rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
+            found = [c._replace(**{field: row}) for c, row in zip(found, rows, strict=True)]
     steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
     for own, curve in zip(cycle(len(found)), found, strict=True):
         color = colors.get(curve.short, own)
@@ -202,17 +206,6 @@ def _draw(
         label = "limit" if level == levels[-1] else "_limit"
         axes.axhline(level, ls="--", lw=0.9, color="#555555", label=label)
     axes.set(xlabel="t [s]", ylabel="" if unit == "1" else f"[{unit}]")
-
-
-def _with_gaps(found: Sequence[Curve]) -> list[Curve]:
-    """Insert gaps into attitude curves at 180 degrees, where the quaternion changes its sign."""
-    broken = list(found)
-    for field in ("values", "linear", "reference"):
-        if getattr(found[0], field) is not None:
-            rows = np.array([getattr(each, field) for each in found])
-            rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
-            broken = [c._replace(**{field: row}) for c, row in zip(broken, rows, strict=True)]
-    return broken
 
 
 def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> None:

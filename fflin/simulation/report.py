@@ -269,13 +269,12 @@ def motion_report(motion: Motion) -> str:
         rows = [["error", "unit", "initial", "largest", "final"]]
         rows[0].append(f"settles to {100.0 * SETTLED:g} % at [s]")
         rows += [kind.row for kind in kinds]
-        parts.append(f"\n{grid(rows, 'll')}\n")
-    elif not motion.target.size:
+    else:
         rows = [["change from the start", "unit", "largest", "final"]]
         for kind in error_sizes(replace(motion, target=motion.x[0])):
             if kind.title in (*_PLACES, *_OF_MODES["q_m"]):
                 rows.append([kind.title, kind.unit, *_cells(kind.largest, kind.final)])
-        parts.append(f"\n{grid(rows, 'll')}\n")
+    parts.append(f"\n{grid(rows, 'll')}\n")
     if motion.modes:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():

@@ -329,8 +329,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     if not stopped.startswith(("diverged", "interrupted")):
         record()
     q_of, v_of, u_of, momentum, center = np.split(rows[: len(at)], ends, axis=1)
-    found = np.array(at), q_of, v_of, u_of, momentum, center
-    return Recording(*found, step + 1, stopped, "python")
+    return Recording(np.array(at), q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
 
 
 def stop_conditions(plan: Plan) -> StopConditions:

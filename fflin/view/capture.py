@@ -145,11 +145,10 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
                 timer.start()
                 browser = _Browser(process)
                 yield browser, folder
-                with suppress(_BrowserError, subprocess.TimeoutExpired):
-                    # Close the browser before killing it, because only a closed browser removes its
-                    # temporary files.
-                    browser.session = {}
-                    browser.tell("Browser.close")
+                # Without commands, the browser exits and removes its temporary files. A killed
+                # browser would leave them.
+                browser.commands.close()
+                with suppress(subprocess.TimeoutExpired):
                     process.wait(5.0)
             finally:
                 timer.cancel()
@@ -171,21 +170,21 @@ class _Browser:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         assert process.stdin and process.stdout
-        self._commands, self._answers = process.stdin, process.stdout
+        self.commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
         # Tab to which commands are sent; if empty, they are sent to the browser.
-        self.session: dict[str, str] = {}
+        self._session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
-        self.session = {"sessionId": attached["sessionId"]}
+        self._session = {"sessionId": attached["sessionId"]}
 
     def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
         self._number += 1
-        command = {"id": self._number, "method": method, "params": parameters, **self.session}
+        command = {"id": self._number, "method": method, "params": parameters, **self._session}
         with suppress(BrokenPipeError):  # reading the answer reports the error
-            self._commands.write(json.dumps(command).encode() + b"\0")
+            self.commands.write(json.dumps(command).encode() + b"\0")
         answer: dict[str, Any] = {}
         while answer.get("id") != self._number:  # skip messages that are not the answer
             pieces = [self._rest]

@@ -64,8 +64,6 @@ class Live:
         self._running, self._state, self._clients = False, "{}", set[_Socket]()
         self._page, page.window.forward = page, partial(self._each, _Socket.send)
         self.meshcat, self.notes = page.meshcat, tuple(page.notes)
-        poses = body_poses(robot, q)
-        page.set_stage(poses)
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         sliders = [
             {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
@@ -73,7 +71,7 @@ class Live:
         ]
         self._html = page.html(
             "live",
-            page.drawing.points(poses),
+            page.points,
             follow=bool(follow),
             joints=sliders,
             names=[*axes, *robot.joint_names],

@@ -189,16 +189,11 @@ class Drawing:
 
 def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
-    model, pieces = robot.model, robot.pieces
-    if not model.existFrame(shape.link, pin.FrameType.BODY):  # a body drawn as a box of its inertia
-        mass, at = model.inertias[shape.joint].mass, pin.SE3.Identity()
-    else:
-        known = pieces.get(shape.link) or robot.links.get(shape.link)
-        mass, at = known.mass if known else 0.0, find_frame(model, shape.link)[1]
-        for bending in bendings(robot).values():
-            if bending.node == shape.joint:
-                at = bending.frame.actInv(at)
-    return [mass, *pin.SE3ToXYZQUAT(at).round(6).tolist()]
+    known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
+    mass = known.mass if known else 0.0
+    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # its inertia is drawn
+        mass = robot.model.inertias[shape.joint].mass
+    return [mass, *pin.SE3ToXYZQUAT(shape.at).round(6).tolist()]
 
 
 def typed(array: Array | Indices, kind: str = "<f4") -> object:
@@ -322,9 +317,14 @@ def subtitle(robot: Robot) -> str:
 
 
 class Page:
-    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read."""
+    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read.
 
-    def __init__(self, robot: Robot, scene: str, tool: str | None, frame: str | None) -> None:
+    The first frame shows the configuration `q` (nq,).
+    """
+
+    def __init__(
+        self, robot: Robot, q: Array, scene: str, tool: str | None, frame: str | None
+    ) -> None:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
         self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
         self.meshcat = Visualizer(window=self.window)
@@ -342,15 +342,11 @@ class Page:
                 nozzle["position"] = placement.act(np.array(item.position)).tolist()
                 nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
                 self.nozzles.append(nozzle)
-        self.floor, self.centre = np.zeros(3), np.zeros(3)  # [m] `floor` is below the robot
-        self.size = 1.0  # [m] radius of the robot in the first frame
-
-    def set_stage(self, poses: Array) -> None:
-        """Set the floor, centre and size from the poses (njoints - 1, 7) in the first frame."""
-        points = self.drawing.points(poses)
-        low, high = points.min(axis=0), points.max(axis=0)
+        # [m] Corners, centre and radius of the robot in the first frame, and the floor below it.
+        self.points = self.drawing.points(body_poses(robot, q))
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
         self.centre = (low + high) / 2.0
-        self.size = max(float(np.linalg.norm(points - self.centre, axis=1).max()), 1e-3)
+        self.size = max(float(np.linalg.norm(self.points - self.centre, axis=1).max()), 1e-3)
         self.floor = np.array([*self.centre[:2], low[2]])
 
     def html(self, mode: str, points: Array, **entries: object) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -21,7 +21,7 @@ from fflin.base.validation import Array
 from fflin.base.writing import read_file, reason, shown
 from fflin.robot.catalog import find_mesh
 from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
-from fflin.robot.joints import ROOT, find_frame, find_joint
+from fflin.robot.joints import ROOT, Carried, find_frame, find_joint
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import read_pose
 from fflin.robot.urdf.reader import SIZE_LIMIT, plain_root
@@ -45,6 +45,7 @@ class Shape:
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # of the link in the joint's frame
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -59,14 +60,18 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     for prefix, other in robot.attached:
         theirs, said = shapes(other)
         notes += said
+        carriers = carriers_of(robot, prefix, other)
         for shape in theirs:
-            joint, held = find_frame(robot.model, prefix)
-            if shape.joint > ROOT:
-                name = other.model.names[shape.joint]
-                joint, held = find_joint(robot.model, f"{prefix}.{name}")
-            placement, link = held * shape.placement, f"{prefix}.{shape.link}"
-            found.append(replace(shape, joint=joint, placement=placement, link=link))
+            joint, held = carriers[shape.joint - ROOT]
+            placement, link, at = held * shape.placement, f"{prefix}.{shape.link}", held * shape.at
+            found.append(replace(shape, joint=joint, placement=placement, link=link, at=at))
     return tuple(found), tuple(notes)
+
+
+def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
+    """Return where a robot carries the base and joints of a payload that is attached to it."""
+    names = [f"{prefix}.{name}" for name in list(payload.model.names)[ROOT + 1 :]]
+    return [find_frame(robot.model, prefix), *(find_joint(robot.model, name) for name in names)]
 
 
 def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
@@ -112,7 +117,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 except ValueError:
                     unreadable.append(file.name)
                     continue
-            yield Shape(joint, kind, size, placement, color, finish, file, frame.name)
+            yield Shape(joint, kind, size, placement, color, finish, file, frame.name, at)
     yield from _balls(robot, bent)
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent

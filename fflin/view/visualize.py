@@ -162,13 +162,13 @@ def visualize(
                 "returns it"
             )
         port = whole("port", port, 0, 2**16 - 1)
-        start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
+        q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
         from fflin.view.page import Page
 
         pace = positive("speed", 1.0 if speed is None else speed)
-        page = Page(robot, scene, tool, frame)
-        live = Live(page, start, follow=follow, speed=pace, port=port)
+        page = Page(robot, q, scene, tool, frame)
+        live = Live(page, q, follow=follow, speed=pace, port=port)
         for note in page.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -185,16 +185,16 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        page = Page(robot, scene, tool, motion.lin.frame)
-        found = mode_page(page, motion)
+        found, notes = mode_page(robot, motion, scene, tool)
     else:
         robot = _robot_of(robot, motion)
-        fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
+        start, end = float(motion.t[0]), float(motion.t[-1])
+        fps, speed, times = check_playback(fps, speed, times, start, end)
         goal = None if target is None else _configuration(robot, "target", target)
-        page = Page(robot, scene, tool, motion.frame)
+        page = Page(robot, motion.q[0], scene, tool, motion.frame)
         found = motion_page(page, motion, fps, speed, follow, goal)
-        contents = _pictures(found, outputs, motion, speed, times)
-    for note in page.notes:
+        contents, notes = _pictures(found, outputs, motion, speed, times), page.notes
+    for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
     write_atomically(contents | ({shown: found.encode()} if shown else {}))
@@ -213,15 +213,11 @@ def _temporary(name: str) -> Path:
 
 def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
     """Return {ending: path} of the requested files; raise an error if one cannot be written."""
-    outputs = {}
-    for ending, file in files.items():
-        if file is None:
-            continue
-        path = as_path(file)
+    outputs = {ending: as_path(file) for ending, file in files.items() if file is not None}
+    for ending, path in outputs.items():
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
         check_output_path(path)
-        outputs[ending] = path
     check_distinct(*outputs.values())
     if ".png" in outputs or ".gif" in outputs:
         from fflin.view.capture import find_chromium
@@ -240,8 +236,7 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
         return None
     if model.existFrame("tool"):
         return "tool"
-    depths = [len(support) for support in model.supports.tolist()]
-    deepest = max(range(ROOT, model.njoints), key=lambda joint: depths[joint])
+    deepest = max(range(ROOT, model.njoints), key=lambda joint: len(model.supports[joint]))
     links = [
         frame.name
         for frame in model.frames.tolist()
@@ -250,15 +245,24 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
     return links[-1] if links else None
 
 
-def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
-    """Check fps and speed, and return them; for speed=None, choose a speed for the duration [s]."""
+def check_playback(
+    fps: float, speed: float | None, times: Sequence[float] | None, start: float, end: float
+) -> tuple[float, float, list[float] | None]:
+    """Check and return fps, speed and the times [s] of pictures of a motion from start to end [s].
+
+    For speed=None, choose a speed for the duration of the motion.
+    """
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
     nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
     if speed is None:
-        speed = next((s for s in nice if duration <= s * _LONGEST), 1e6)
-    return fps, positive("speed", speed)
+        speed = next((s for s in nice if end - start <= s * _LONGEST), 1e6)
+    if times is not None:
+        times = [number("a time", time) for time in times]
+        if not times or not all(start <= time <= end for time in times):
+            raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
+    return fps, positive("speed", speed), times
 
 
 def _robot_of(robot: Robot, motion: Motion) -> Robot:
@@ -285,14 +289,6 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
         raise InputError(f"{name} is not a configuration: {error}") from None
 
 
-def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
-    """Check and return the times [s] of pictures; raise an error if one is outside the motion."""
-    times = [number("a time", time) for time in times]
-    if not times or not all(start <= time <= end for time in times):
-        raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
-    return times
-
-
 def _pictures(
     page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
 ) -> dict[Path, bytes]:
@@ -306,7 +302,6 @@ def _pictures(
         # motion never settles, so its pictures are evenly spaced.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
-    times = check_times(times, start, end)
     contents = {}
     if ".png" in outputs:
         contents[outputs[".png"]] = take_png(page, times)

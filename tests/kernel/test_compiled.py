@@ -36,7 +36,7 @@ def compiled(monkeypatch, tmp_path, signatures):
     from fflin.kernel import machine_code
 
     new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path), compile=signatures.append)
-    monkeypatch.setattr(machine_code, "translated", lambda function: new)
+    monkeypatch.setattr(machine_code, "translated", lambda function, how: new)
     kernel_code._prepared.cache_clear()
     yield new
     kernel_code._prepared.cache_clear()

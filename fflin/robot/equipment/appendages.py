@@ -383,16 +383,9 @@ class Slosh:
         omega = math.sqrt(acceleration * k * math.tanh(k * height))
         at = height - 2.0 / k * math.tanh(0.5 * k * height)
         center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
-        return cls(
-            frame,
-            share * liquid,
-            tuple(center.tolist()),
-            omega / (2.0 * math.pi),
-            acceleration / omega**2 if pendulum else None,
-            along,
-            damping,
-            name,
-        )
+        position, frequency = tuple(center.tolist()), omega / (2.0 * math.pi)
+        length = acceleration / omega**2 if pendulum else None
+        return cls(frame, share * liquid, position, frequency, length, along, damping, name)
 
     @property
     def title(self) -> str:
