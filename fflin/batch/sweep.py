@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FflinWarning, InputError, located
+from fflin.base.errors import FflinWarning, located
 from fflin.base.record import content_digest
 from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
 from fflin.batch.configurations import Configurations, checked_points, checked_rows
@@ -25,7 +25,7 @@ from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.kernel.compiled import checked_engine
+from fflin.kernel.compiled import compiles
 from fflin.kernel.tree import LANES
 from fflin.linear.linearization import LARGEST, Linearizer
 from fflin.linear.state_equations import assemble, drift
@@ -184,15 +184,9 @@ class ChunkJob:
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
         self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
         self.linearizer, prepared = linearizer, linearizer.prepared
-        reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
-        if reason and engine == "compiled":
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
         # Compiled function for the accelerations at many points; None if Python computes them.
-        self._kernel: RowAccelerations | None = None
-        if engine != "python" and not reason:
-            self._kernel = prepared.kernel()
+        compiled = compiles(engine, lambda: prepared.not_compilable)
+        self._kernel = prepared.kernel() if compiled else None
         self.threaded = self._kernel is not None
         # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
         # each point is its own reference. Only B is then computed.

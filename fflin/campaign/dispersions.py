@@ -483,7 +483,7 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
 def _mounted(
     robot: Robot,
 ) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int, Array]]:
-    """Yield (index in `robot.inputs`, item, names, index in u, direction) of thrusters and wheels."""
+    """Yield thrusters and wheels: index in `robot.inputs`, item, names, index in u, direction."""
     first = 0
     for place, (item, names) in enumerate(named_inputs(robot.inputs)):
         if isinstance(item, Thruster | ReactionWheel):
