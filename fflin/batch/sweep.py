@@ -25,9 +25,9 @@ from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.kernel.compiled import compiles
-from fflin.kernel.tree import LANES
-from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.kernel.compiled import compiles, numba_is_there
+from fflin.kernel.tree import LANES, batch_tree
+from fflin.linear.linearization import LARGEST, Linearizer, Prepared
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -174,6 +174,24 @@ def sweep(
     return batch
 
 
+def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
+    """Return the compiled function for the accelerations, or None if Python computes them."""
+    robot, tree, reason = prepared.robot, batch_tree(prepared.robot), ""
+    if prepared.sensing is not None:
+        reason = "the outputs are not the state"
+    elif not numba_is_there():
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+    elif robot.orbit:
+        reason = f"'{robot.name}' is in orbit"
+    elif tree is None:
+        reason = f"a joint of '{robot.name}' has an unsupported type"
+    if not compiles(engine, lambda: reason) or tree is None:
+        return None
+    from fflin.kernel.derivatives import RowAccelerations
+
+    return RowAccelerations(prepared.map, prepared.actuation, tree)
+
+
 class ChunkJob:
     """Job that linearises chunks of points with `Linearizer`.
 
@@ -184,9 +202,7 @@ class ChunkJob:
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
         self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
         self.linearizer, prepared = linearizer, linearizer.prepared
-        # Compiled function for the accelerations at many points; None if Python computes them.
-        compiled = compiles(engine, lambda: prepared.not_compilable)
-        self._kernel = prepared.kernel() if compiled else None
+        self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
         # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
         # each point is its own reference. Only B is then computed.
