@@ -348,17 +348,13 @@ class Robot(Coordinates):
                 return changed
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
-    @property
-    def pieces(self) -> dict[str, mass_properties.Piece]:
-        """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        return self._links_and_bodies[0]
+    pieces = cached_property(mass_properties.pieces_of)
 
-    @property
+    @cached_property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
-        return self._links_and_bodies[1]
-
-    _links_and_bodies = cached_property(mass_properties.pieces_of)
+        pieces = self.pieces
+        return {each.body: name for name, each in pieces.items() if each.body not in pieces}
 
     @property
     def used_frames(self) -> tuple[str, ...]:
