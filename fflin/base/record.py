@@ -78,9 +78,8 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
-        raise FileError(
-            f"{writing.shown(path)}: not a {what} saved by fflin ({writing.reason(error)})"
-        ) from None
+        why = writing.reason(error)
+        raise FileError(f"{writing.shown(path)}: not a {what} saved by fflin ({why})") from None
 
 
 def require_finite(record: Mapping[str, object]) -> None:

@@ -224,9 +224,9 @@ class Coordinates:
     def _sized(self, name: str, value: ArrayLike, size: int, of_what: str) -> Array:
         """Return a vector (size,); the error for a longer vector names removed coordinates."""
         if self._removed and np.size(value) > size:
-            removed = ", ".join(self._removed)
+            gone = ", ".join(self._removed)
             of_what += (
-                f"; the coordinates {removed} were removed with the replaced inputs or appendages"
+                f"; the coordinates {gone} were removed with the replaced inputs or appendages"
             )
         return vector(name, value, size, of_what)
 

@@ -257,7 +257,6 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
-    idle: tuple[str, ...] = ()
     # If M is singular at two random configurations, it is almost surely singular at all of them.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
@@ -267,10 +266,9 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
         rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
         involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
-        idle = tuple(dict.fromkeys(names[involved].tolist()))
-        if not idle:
-            break
-    return idle
+        if not involved.any():
+            return ()
+    return tuple(dict.fromkeys(names[involved].tolist()))
 
 
 def coordinate_names(robot: Robot) -> list[str]:
@@ -336,8 +334,7 @@ def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
     if linear.any():  # a joint that translates
         return False
     body, turn = robot.model.inertias[index], skew(axis)
-    inertia = body.inertia
-    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
-    largest = float(np.abs(inertia).max())
+    uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
+    largest = float(np.abs(body.inertia).max())
     offset = body.mass * float(np.square(turn @ body.lever).sum())
     return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

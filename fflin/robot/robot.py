@@ -399,12 +399,9 @@ class Robot(Coordinates):
         for joint in self.joints:
             if joint.name == name:
                 return joint
-        for follower in self.followers:
-            if follower.joint.name == name:
-                raise InputError(
-                    f"joint '{name}' mimics '{follower.leader.name}'; give "
-                    f"'{follower.leader.name}' instead"
-                )
+        leader = {each.joint.name: each.leader.name for each in self.followers}.get(name)
+        if leader:
+            raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")
         if name in (wheel for wheel, _ in named_wheels(self.inputs)):
             raise InputError(
                 f"wheel '{name}' has no inertia, so it is not a joint and has no speed; give the "

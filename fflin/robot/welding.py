@@ -71,11 +71,8 @@ def locked_model(
     given = joints_by_name("joint to lock", requested(lock), movable, find)
     values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
-        leader_value = values.get(mimic.leader, 0.0) or 0.0
-        if mimic.leader in values or values.get(name, 0.0) is None:
-            values.setdefault(name, None)
-            if values[name] is None:
-                values[name] = mimic.multiplier * leader_value + mimic.offset
+        if values.get(name) is None and (name in values or mimic.leader in values):
+            values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
     q, indices, locked = pin.neutral(model), [], []
     for name, value in values.items():
         index = model.getJointId(name)
