@@ -185,8 +185,7 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        if self.followers:
-            self.follow(q)
+        self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:

@@ -389,8 +389,7 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file; see `load_inputs`."""
     inputs = tuple(_built(document, "input", _input_type))
     if not inputs:
-        message = "the file contains no inputs; add a table [[input]] with its type"
-        raise InputError(f"{document.path}: {message}")
+        raise document.error("the file contains no inputs; add a table [[input]] with its type")
     return inputs
 
 

@@ -122,14 +122,10 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     model = _appended(bare.model, frame, other.model, placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
-        return joint._replace(name=f"{prefix}.{joint.name}").within(model)
+        return joint._replace(name=f"{prefix}.{joint.name}")
 
-    own = [each.within(model) for each in bare.joints]
-    theirs = [renamed(each) for each in other.joints]
-    followers = [
-        *(f.within(model) for f in bare.followers),
-        *(Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers),
-    ]
+    joints = [each.within(model) for each in (*bare.joints, *map(renamed, other.joints))]
+    theirs = (Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers)
     both: dict[str, Any] = {
         name: getattr(robot, name)
         | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
@@ -144,8 +140,8 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         bare,
         model=model,
         urdf_sha256=sha256(identity.encode() + dynamic_parameters(model)).hexdigest(),
-        joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
-        followers=tuple(followers),
+        joints=tuple(sorted(joints, key=lambda each: each.idx_v)),
+        followers=tuple(each.within(model) for each in (*bare.followers, *theirs)),
         links=both.pop("links"),
     )
     name, attached = f"{robot.name}+{other.name}", (*robot.attached, (prefix, other))
