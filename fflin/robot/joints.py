@@ -246,8 +246,7 @@ class Coordinates:
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` if the model was changed in place after the robot was made."""
-        assert self._as_made is not None
-        made = self._as_made[1]
+        made = self._as_made[1] if self._as_made else self.model
         # The comparison takes a microsecond; `change_in` runs only if the models differ.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
