@@ -166,8 +166,8 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 
 # Checks of the fields, in the order in which a robot file applies them. Inputs come before the
 # fields that refer to the inputs by name. `Robot.replace` checks the first three fields itself.
-FIELDS: dict[str, Callable[[object, Robot], Any]] = {
-    **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
+FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
+    **dict.fromkeys(("passive", "inputs", "appendages")),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),

@@ -368,12 +368,10 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     with document.located("package_dirs"):
         dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
     # Nested tables become keys with dots. The parts of weights and states remain tables.
-    values = {
-        key: {part: flat(x) for part, x in value.items()}
-        if key in ("weights", "point", "target", "start") and isinstance(value, dict)
-        else flat(value)
-        for key, value in record.items()
-    }
+    values = {key: flat(value) for key, value in record.items()}
+    for key in ("weights", "point", "target", "start"):
+        if isinstance(table := record.get(key), dict):
+            values[key] = {part: flat(value) for part, value in table.items()}
     if "input" in record:
         values["inputs"] = _read_inputs(document)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder

@@ -161,6 +161,11 @@ class LinkMass(NamedTuple):
     placement: pin.SE3  # placement of the <inertial> on the link
 
 
+def link_mass(body: pin.Inertia) -> LinkMass:
+    """Return the mass properties of a link from its inertia in the axes of the link."""
+    return LinkMass(body.mass, body.inertia, pin.SE3(np.eye(3), body.lever))
+
+
 class Piece(NamedTuple):
     """Mass properties of a link or of a whole body, and the joint that moves it."""
 

@@ -240,8 +240,7 @@ class Robot(Coordinates):
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
-        own = ("passive", "inputs", "appendages")
-        checked = {k: FIELDS[k](value, robot) for k, value in fields.items() if k not in own}
+        checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
         # With `merged`, joints that are not named keep their values. Otherwise, only modes do.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):

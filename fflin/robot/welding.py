@@ -5,7 +5,6 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import Any, cast
 
-import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
@@ -14,7 +13,7 @@ from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
-from fflin.robot.mass_properties import LinkMass, dynamic_parameters
+from fflin.robot.mass_properties import dynamic_parameters, link_mass
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic
@@ -132,9 +131,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
     if not other.links:  # a single body, whose mass properties get the name of the prefix
-        body = other.model.inertias[ROOT]
-        at_center = pin.SE3(np.eye(3), body.lever)
-        both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
+        both["links"][prefix] = link_mass(other.model.inertias[ROOT])
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     bare = replace(
         bare,
