@@ -33,9 +33,9 @@ from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
-from fflin.kernel.compiled import checked_engine
-from fflin.kernel.tree import LANES
-from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.kernel.compiled import checked_engine, numba_is_there
+from fflin.kernel.tree import LANES, batch_tree
+from fflin.linear.linearization import LARGEST, Linearizer, Prepared
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -189,6 +189,28 @@ def sweep(
     return batch
 
 
+def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
+    """Return the compiled function for the accelerations, or None if Python computes them."""
+    if checked_engine(engine) == "python":
+        return None
+    robot, tree = prepared.robot, batch_tree(prepared.robot)
+    if prepared.sensing is not None:
+        reason = "the outputs are not the state"
+    elif not numba_is_there():
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+    elif robot.orbit:
+        reason = f"'{robot.name}' is in orbit"
+    elif tree is None:
+        reason = f"a joint of '{robot.name}' has an unsupported type"
+    else:
+        from fflin.kernel.derivatives import RowAccelerations
+
+        return RowAccelerations(prepared.map, prepared.actuation, tree)
+    if engine == "compiled":
+        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
+    return None
+
+
 class ChunkJob:
     """Job that linearises chunks of points with `Linearizer`.
 
@@ -210,15 +232,7 @@ class ChunkJob:
         self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
-        reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
-        if reason and engine == "compiled":
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
-        # Compiled function for the accelerations at many points; None if Python computes them.
-        self._kernel: RowAccelerations | None = None
-        if engine != "python" and not reason:
-            self._kernel = prepared.kernel()
+        self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
         self._data = robot.create_data()
         self._inertia = Inertia(prepared.map, self._data)

@@ -315,8 +315,6 @@ def _points(
         drawn = {"seed": arguments.seed, "ranges": ranges, "base": base}
         return fflin.random_configurations(robot, arguments.random, **drawn), v, u
     axes = once("--grid", arguments.grid)
-    for name in axes:
-        robot.joint(name)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
     joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
     others = {name: x for name, x in joints.items() if name not in axes or name in fixed}

@@ -15,6 +15,7 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array, ArrayLike, dimension, instance
+from fflin.control.default_weights import Pace
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
@@ -130,7 +131,7 @@ def lqr(
     require_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
+        Q, R, N, rule = rule_weights(lin, weights, Pace(hold=lin.dt), wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)

@@ -142,8 +142,6 @@ def plan(
     shooting = Shooting(robot, t, hold == "previous")
     acting = chosen_limits(robot, limits)[0]
     low, high = input_limits(robot, acting)
-    if (low > high).any():
-        raise InputError("the lower limit of an input is above its upper limit; correct limits=")
     size = np.maximum(np.abs(low), np.abs(high))
     by_limits = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
     matrix = weight("R", by_limits if R is None else R, input_keys(actuation), definite=True)

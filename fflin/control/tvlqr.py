@@ -325,7 +325,7 @@ def tvlqr(
     names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
+        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace)
     elif weights is not None or Q is None or R is None:
         raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, _ = cost_weights(traj, Q, R, None)

@@ -252,11 +252,7 @@ def _diagonal(
 
 
 def rule_weights(
-    lin: LinearModel,
-    given: Rule | None,
-    *,
-    wheel_speeds: bool | None = None,
-    pace: Pace | None = None,
+    lin: LinearModel, given: Rule | None, pace: Pace, wheel_speeds: bool | None = None
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N by a rule with given weights, and a description of the rule."""
     # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
@@ -268,8 +264,6 @@ def rule_weights(
     name = own.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(lin.B.shape))
     if name is None or name == "urdf":
-        pace = pace or Pace()
-        pace = pace._replace(hold=lin.dt or pace.hold)
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape

@@ -27,7 +27,7 @@ from fflin.dynamics.integrators import integrate_rows
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_fit, require_sensed
+from fflin.linear.fit import require_fit
 from fflin.linear.model import Certificate, LinearModel, refuse_sampled
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.outputs import FullState
@@ -214,8 +214,7 @@ def check_all(
 def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str, float], float]]:
     """Yield the name, the errors {block: error} and the tolerance of each comparison."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    require_fit(lin, robot, state, whole=True)
-    require_sensed(lin, state)
+    require_fit(lin, robot, state, whole=True, sensed=True)
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
     aba, M = Aba(state), inertia_matrix(robot, lin)
     A, B, aba_inverse = aba_route(aba, q, v, lin.u0, moving=lin.moving)
@@ -230,11 +229,22 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     yield "ABA derivatives", scales.errors(A, B), by_aba
 
-    model, nx, steps = Nonlinear(aba, lin), state.nx, scales.difference_steps()
+    model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
+    # The accelerations of light, aligned links change over small rotations. The step of a finite
+    # difference is smaller than these rotations.
+    steps = np.full(nx + len(lin.u0), 2e-4)
+    # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
+    steps[g.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
+    # f is quadratic in the velocities and linear in the inputs, so these steps can be large without
+    # a truncation error.
+    speed = np.abs(lin.x0[-nv:])
+    steps[nv:nx] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
+    steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
+    steps[nx:] = max(1.0, _largest(lin.f0[-nv:] / scales.mobility)) / scales.input_mobility
     # f is at most quadratic in every variable except the attitude and the joint positions.
     bends = np.zeros(len(point), dtype=bool)
-    bends[state.groups.q_b] = bends[state.groups.q_m] = True
+    bends[g.q_b] = bends[g.q_m] = True
     slopes = jacobian(model.rates, point, steps, bends)
     rounding = _STEP_ULPS * _EPS / difference
     errors = scales.errors(slopes[:, :nx], slopes[:, nx:], steps=steps[:nx], rounding=rounding)
@@ -244,7 +254,10 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
 
     x0 = state.read(q, v, near=lin.x0)
     yield "point", {"x0": _largest(lin.x0 - x0) / max(1.0, _largest(x0))}, route
-    yield "point", scales.rate_errors(model.rates(point[None])[0]), route
+    f0, sizes = model.rates(point[None])[0], np.append(np.ones(nv), scales.mobility * scales.push)
+    for name, part in g._asdict().items():
+        size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
+        yield "point", {f"f0[{name}]": _largest(lin.f0[part] - f0[part]) / size}, route
 
     # If the inputs are the default ones, the lower half of B is M^-1.
     inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
@@ -342,7 +355,8 @@ def aba_route(
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
-    there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
+    (rates,) = state.velocities(aba.accelerations(at_origin[None], v[None], u[None]))
+    there = own.jacobians(q, nu, u, rates)
     # Upper half of A: kinematics of a small displacement, in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
@@ -366,11 +380,11 @@ class Scales:
         self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         # Mobilities: sqrt((M^-1)_ii) (6 + n,) of each coordinate, and sqrt(b^T M^-1 b) (nu,) of
         # each input, where b is the generalised force per unit of the input.
-        self._mobility = np.sqrt(np.linalg.inv(M).diagonal())
+        self.mobility = np.sqrt(np.linalg.inv(M).diagonal())
         lower = B[-self._nv :]
         inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
-        self._input_mobility = np.where(inputs > 0.0, inputs, 1.0)
-        self._terms, self._push = self._sizes(self._v)
+        self.input_mobility = np.where(inputs > 0.0, inputs, 1.0)
+        self._terms, self.push = self._sizes(self._v)
 
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
@@ -389,8 +403,8 @@ class Scales:
         if steps is not None:
             there, _ = self._sizes(np.abs(self._v) + state.spread(steps[-nv:]))
             terms = np.maximum(terms, rounding * there)
-        row_scale = np.concatenate((np.ones(nv), self._mobility))[:, None]
-        column_scale = np.where(np.arange(2 * nv)[:, None] < nv, 1.0, self._input_mobility)
+        row_scale = np.concatenate((np.ones(nv), self.mobility))[:, None]
+        column_scale = np.where(np.arange(2 * nv)[:, None] < nv, 1.0, self.input_mobility)
         of_A, of_B = (lin.A - A) / row_scale, (lin.B - B) / row_scale / column_scale
         own, groups, errors = lin.A / row_scale, state.groups._asdict(), dict[str, float]()
         for i, (row, rows) in enumerate(groups.items()):
@@ -405,7 +419,7 @@ class Scales:
         """Return the sizes (6, 6) of cancelling terms in each block of the scaled A, and in f0."""
         # The base's linear velocity is reduced by _ROUNDING_FRACTION, because it causes only
         # rounding errors in Pinocchio's derivatives.
-        mobility, lin, robot = self._mobility, self._lin, self._state.robot
+        mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
             if name in robot.wheels:  # a wheel counts by its momentum, not by its speed
@@ -421,7 +435,7 @@ class Scales:
         slowed[LINEAR] *= _ROUNDING_FRACTION
         resting, unit = slowed / mobility, 1.0 / mobility
         accelerations = _largest(lin.f0[-self._nv :] / mobility)
-        forces = _largest(lin.u0 * self._input_mobility)
+        forces = _largest(lin.u0 * self.input_mobility)
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
@@ -432,31 +446,6 @@ class Scales:
         terms[3:, 3:] = turning
         terms[:, 0] *= _largest(self._state.chart(lin.q).J)
         return terms, forces + rate**2 * _largest(unit) + rate * momentum * _largest(mobility)
-
-    def rate_errors(self, f0: Array) -> dict[str, float]:
-        """Compare the model with another f0, relative to the largest terms that f0 sums."""
-        sizes = np.concatenate((np.ones(self._nv), self._mobility * self._push))
-        errors = dict[str, float]()
-        for name, part in self._state.groups._asdict().items():
-            size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
-            errors[f"f0[{name}]"] = _largest(self._lin.f0[part] - f0[part]) / size
-        return errors
-
-    def difference_steps(self) -> Array:
-        """Return the steps (nx + nu,) of finite differences over x and u at the model's point."""
-        state, lin, nv = self._state, self._lin, self._nv
-        # The accelerations of light, aligned links change over small rotations. The step is smaller
-        # than these rotations.
-        step = np.full(2 * nv, 2e-4)
-        # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
-        step[state.groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[state.groups.q_b]))
-        # f is quadratic in the velocities and linear in the inputs, so these steps can be large
-        # without a truncation error.
-        speed = np.abs(lin.x0[-nv:])
-        step[-nv:] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
-        step[state.groups.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
-        push = max(1.0, _largest(lin.f0[-nv:] / self._mobility)) / self._input_mobility
-        return np.concatenate((step, push))
 
 
 class Nonlinear:

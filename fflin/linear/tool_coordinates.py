@@ -91,13 +91,12 @@ class ToolCoordinates:
                 "the robot a BaseTorque too"
             )
         # For each input of the tool, the index of the robot's input.
-        self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
+        self.inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
-            self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
+            self.inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
-            self._inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
-        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
+            self.inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
@@ -227,7 +226,7 @@ class ToolCoordinates:
         V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
         held = self._held(np.linalg.solve(X.T, wrench @ u))
         H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
-        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self.inputs], H, extra)
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:

@@ -209,6 +209,12 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
     for index, (_, item) in pulsed_thrusters(robot).items():
         high[index] = min(high[index], item.max or math.inf)
+    for name, least, largest in zip(inputs, low.tolist(), high.tolist(), strict=True):
+        if least > largest:
+            raise InputError(
+                f"the lower limit of {name} is {least:g}, above its upper limit {largest:g}; "
+                "correct limits= or the limits of the input"
+            )
     return low, high
 
 

@@ -115,11 +115,8 @@ class Uncertain:
                 found |= dict.fromkeys(known.find(key), value)
         return known.robot(found)
 
-    def makes(self, delta: Array) -> bool:
-        """Return whether the robot with the deltas (k,) is physically realisable."""
-        return not self._refusal(delta)
-
-    def _refusal(self, delta: Array) -> str:
+    def refusal(self, delta: Array) -> str:
+        """Return why the robot with deltas (k,) is not physically realisable, or an empty text."""
         values = dict[str, float]()
         for block, d in zip(self.blocks, delta, strict=True):
             values |= block.values(block.middle + block.half * d)
@@ -134,7 +131,7 @@ class Uncertain:
         found, lost = list[Array](), 0
         while len(found) < count:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
-            if not (why := self._refusal(delta)):
+            if not (why := self.refusal(delta)):
                 found.append(delta)
             elif (lost := lost + 1) >= _TRIES * (len(found) + 1):
                 raise InputError(
@@ -289,7 +286,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
             raise InputError(
                 f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
             )
-    if why := made._refusal(np.zeros(len(made.blocks))):
+    if why := made.refusal(np.zeros(len(made.blocks))):
         raise InputError(
             f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
         )

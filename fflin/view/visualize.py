@@ -167,7 +167,7 @@ def visualize(
         from fflin.view.page import Page
 
         pace = positive("speed", 1.0 if speed is None else speed)
-        page = Page(robot, scene, tool, frame)
+        page = Page(robot, q, scene, tool, frame)
         live = Live(page, q, follow=follow, speed=pace, port=port)
         for note in page.notes:
             warn(note, FflinWarning, stacklevel=2)
@@ -185,17 +185,16 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        page = Page(robot, scene, tool, motion.lin.frame)
-        found = mode_page(page, motion)
+        found, notes = mode_page(robot, motion, scene, tool)
     else:
         robot = _robot_of(robot, motion)
         start, end = float(motion.t[0]), float(motion.t[-1])
         fps, speed, times = check_playback(fps, speed, times, start, end)
         goal = None if target is None else _configuration(robot, "target", target)
-        page = Page(robot, scene, tool, motion.frame)
+        page = Page(robot, motion.q[0], scene, tool, motion.frame)
         found = motion_page(page, motion, fps, speed, follow, goal)
-        contents = _pictures(found, outputs, motion, speed, times)
-    for note in page.notes:
+        contents, notes = _pictures(found, outputs, motion, speed, times), page.notes
+    for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
     write_atomically(contents | ({shown: found.encode()} if shown else {}))

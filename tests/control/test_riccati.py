@@ -153,7 +153,7 @@ def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(r
         U = np.linalg.solve(lin.B[m:], missing[m:])
         cost = V.conj().T @ Q @ V + U.conj().T @ R @ U
         assert own == pytest.approx(cost, rel=1e-6, abs=1e-9 * np.abs(cost).max())
-        residual = Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(modes.lyapunov_modal(own)).residual
+        residual = Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(modes.lyapunov(own)).residual
         assert (residual < 1e-11) == even
 
 
@@ -254,11 +254,13 @@ def test_lyapunov_equations_by_modes(monkeypatch):
     F = rng.normal(size=(9, 9)) - 4.0 * np.eye(9)
     r = rng.normal(size=(9, 9))
     r += r.T
-    assert ModalMatrix.of(F, False).lyapunov(r) == pytest.approx(
+    modes = ModalMatrix.of(F, False)
+    assert modes.lyapunov(modes.V.conj().T @ r @ modes.V) == pytest.approx(
         sl.solve_continuous_lyapunov(F.T, -r), rel=1e-10, abs=1e-12
     )
     F /= 1.2 * np.abs(np.linalg.eigvals(F)).max()
-    assert ModalMatrix.of(F, True).lyapunov(r) == pytest.approx(
+    modes = ModalMatrix.of(F, True)
+    assert modes.lyapunov(modes.V.conj().T @ r @ modes.V) == pytest.approx(
         sl.solve_discrete_lyapunov(F.T, r), rel=1e-10, abs=1e-11
     )
     near = F + 1e-11 * rng.normal(size=F.shape)

@@ -167,7 +167,7 @@ def _half_size(equation: Riccati) -> Solution | None:
                 break
             modes, cost = loop
             near = None if equation.discrete else modes
-            found = _refined(equation, modes.lyapunov_modal(cost), near, "structured") or found
+            found = _refined(equation, modes.lyapunov(cost), near, "structured") or found
         if found is not None and found.residual <= _SOUND:
             break
     return found
@@ -203,7 +203,7 @@ def _refined(
         if modes is None:
             F = equation.A - equation.B @ trial.K
             modes, fresh = ModalMatrix.of(F, equation.discrete), True
-        better = equation.trial(trial.P + modes.lyapunov(trial.defect))
+        better = equation.trial(trial.P + modes.lyapunov(modes.V.conj().T @ trial.defect @ modes.V))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution, a Newton step may improve P although the residual rises, so it is
         # accepted.
@@ -245,12 +245,8 @@ class ModalMatrix:
         poles, V = np.linalg.eig(F)
         return cls(V, poles, discrete)
 
-    def lyapunov(self, r: Array) -> Array:
-        """Solve F' D + D F = -r (discrete: F' D F - D = -r) for a symmetric r (n, n)."""
-        return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
-
-    def lyapunov_modal(self, r: Values) -> Array:
-        """Solve the equation of `lyapunov`, with r given as V^H r V."""
+    def lyapunov(self, r: Values) -> Array:
+        """Solve F' D + D F = -s (discrete: F' D F - D = -s) for a symmetric s, from r = V^H s V."""
         # In modal coordinates, the factors solve the equation element by element.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
