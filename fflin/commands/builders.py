@@ -180,11 +180,9 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
 
 
-def linear_model(
-    arguments: Namespace, robot: fflin.Robot | None = None
-) -> tuple[fflin.Robot, fflin.LinearModel]:
+def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
     """Return the robot and its linear model about the operating point of the arguments."""
-    robot = robot or load_robot(arguments)
+    robot = load_robot(arguments)
     return robot, model_about(robot, arguments, *point_of(robot, arguments))
 
 
@@ -261,7 +259,7 @@ def designed(
     """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
-    _, lin = linear_model(arguments, design)
+    lin = model_about(design, arguments, *point_of(design, arguments))
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
 
 

@@ -151,10 +151,11 @@ class Drawing:
                 }
                 self._send("set_object", body[f"{index}_{part}"], object=content)
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        self.bodies = list(corners)  # Pinocchio joints
-        self.corners = [
-            _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
-        ]
+        # {Pinocchio joint: corners (8, 3) of its body's bounding box}
+        self.corners = {
+            joint: _box_corners(np.eye(4), _bounds(np.concatenate(boxes)))
+            for joint, boxes in corners.items()
+        }
 
     def place(self, poses: Array) -> None:
         """Set the poses (njoints - 1, 7) of all bodies: position, then quaternion x, y, z, w."""
@@ -165,7 +166,7 @@ class Drawing:
     def points(self, poses: Array) -> Array:
         """Return the corners (M, 3) of all bounding boxes in the world."""
         found = []
-        for joint, corners in zip(self.bodies, self.corners, strict=True):
+        for joint, corners in self.corners.items():
             placement = pin.XYZQUATToSE3(poses[joint - ROOT])
             found += [placement.act(corner) for corner in corners]
         return np.array(found)
