@@ -261,6 +261,17 @@ class Linearizer:
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
+    def write_by_u(self, q: Array, out: Array) -> None:
+        """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
+        inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
+        with self._lock:
+            inverse = out if actuation.default else np.empty((nv, nv))
+            inertia.invert(q, inverse)
+            if not actuation.default:
+                # The input matrix does not depend on the base position. So the base is moved to the
+                # origin, which avoids rounding errors.
+                np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
+
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy cannot share the work space, so the constructor builds it again.
         state, moving = self.prepared.map, self.prepared.moving
