@@ -62,8 +62,7 @@ def differentiate(work, tree):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
-    for entry in range(len(tree.row) * width):
-        store(work, tree.lower + entry, 0.0)
+    vec.clear(work, tree.lower, len(tree.row) * width)
     for index in range(n):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
@@ -138,7 +137,7 @@ def _solve(work, tree, slopes):
     none = (zero, zero, zero), (zero, zero, zero)
     # The first six columns, over the base's rotation and translation, are zero.
     for row in range(size):
-        vec.put6(work, slopes + row * width, none)
+        vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
         for k in range(size):
             vec.put6(work, tree.held + k * 6, vec.get6(work, tree.lower + column + k * width))

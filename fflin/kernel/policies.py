@@ -240,8 +240,7 @@ def _feed_back_between(robot, law, point):
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
         store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
-    for index in range(inputs):
-        store(u, index, 0.0)
+    vec.clear(u, 0, inputs)
     for lane in range(vec.lane_count(u)):
         for corner in range(1 << len(grid.joint)):
             weight, cell = _corner(grid, corner, lane)

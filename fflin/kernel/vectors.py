@@ -116,6 +116,12 @@ def copy(source, first, target, to, count):
         store(target, to + index, load(source, first + index))
 
 
+def clear(target, to, count):
+    """Set `count` entries to zero."""
+    for index in range(count):
+        store(target, to + index, 0.0)
+
+
 def add(work, at, value):
     """Add a value to an entry."""
     store(work, at, load(work, at) + value)
