@@ -13,7 +13,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sect
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
-from fflin.kernel.vectors import load, splat, store
+from fflin.kernel.vectors import load, store
 
 # Offsets of the motion vectors of each body: velocity, Psi', acceleration if c = 0, acceleration
 # that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
@@ -50,7 +50,6 @@ def spatial_inertia_times(work, at, motion):
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies, from the base outwards."""
     places, own = tree.places, tree.own
-    one, zero = splat(work, 1.0), splat(work, 0.0)
     vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
     _inertia(work, own, places, tree.bodies, 0)
@@ -62,7 +61,7 @@ def outwards(work, tree, q):
         elif tree.turns[body] != 0.0:
             cosine, sine = vec.cosine_and_sine(tree.turns[body] * value)
         else:
-            cosine, sine = one, zero
+            cosine, sine = 1.0, 0.0
         first = body * PLACE
         axes = vec.get_columns(work, places + tree.parent[body] * PLACE)
         x = vec.product(axes, vec.get3(tree.fixed, first))
@@ -185,8 +184,7 @@ def invert_factor(work, tree):
 def multiply(work, tree, judged):
     """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
-    size = len(tree.row)
-    coupling = splat(work, 0.0)
+    size, coupling = len(tree.row), 0.0
     for i in range(size):
         left = packed + tree.row[i]
         for j in range(i + 1):

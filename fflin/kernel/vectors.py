@@ -64,11 +64,6 @@ def store(array: Entries, index: int, value: Number) -> None:
     array[index] = value
 
 
-def splat(array: Entries, value: float) -> Number:
-    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
-    return value
-
-
 def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
     """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
     return less if left < right else other
