@@ -33,7 +33,7 @@ def run() -> Table:
         weak = ["urdf", limits]
         policy = fflin.mpc(lin, Q, R, horizon=SAMPLES, dt=STEP, limits=weak)
         errors = _errors(robot, policy, turn, weak)
-        own = Receding(policy.horizon)
+        own = Receding(policy.horizon, policy.deviation(robot))
         solvers: dict[str, Solver] = {"fflin": own.step}
         for key, make in (("PIQP", _piqp), ("OSQP", _osqp)):
             try:

@@ -233,12 +233,11 @@ def _by_second_order(
     if source is None:
         return None
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
-    idle, margin = ranks.null_space(system.S.T @ np.diag(1.0 / system.size))
+    idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
-        everything, margin = np.eye(2 * r), margin.transformed(R / system.size)
-        fixed = ranks.FixedPoles(margin=margin)
+        everything, fixed = np.eye(2 * r), ranks.FixedPoles(margin=margin.transformed(R))
         return everything, everything[:0], [], "closed form", fixed
     S = system.S.T
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
@@ -250,10 +249,8 @@ def _by_second_order(
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.
-    size = np.tile(system.size, 2)
-    normal = rows / size
-    normal = np.linalg.qr((normal / np.linalg.norm(normal, axis=1, keepdims=True)).T, "complete")[0]
-    controllable = normal[:, len(rows) :] / size[:, None]
+    exact, scale = ranks.Noisy.exact(rows), 1.0 / np.tile(system.size, 2)
+    controllable, _ = ranks.null_space(exact, scale)
     to_s = np.linalg.inv(
         (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
     )
@@ -347,8 +344,7 @@ def _root(W: Array) -> Array:
     """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
     # The condition number of L is the square root of the condition number of W, so the rank of L is
     # easier to decide.
-    size = np.sqrt(W.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
+    size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
     return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
@@ -380,10 +376,8 @@ def _reached(
         # Rows and columns have different units, so they are scaled to comparable sizes.
         rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
         for _ in range(4):
-            sizes = np.sqrt(np.abs(scaled).max(axis=1))
-            rows /= np.where(sizes > 0.0, sizes, 1.0)
-            sizes = np.sqrt(np.abs(scaled).max(axis=0))
-            columns /= np.where(sizes > 0.0, sizes, 1.0)
+            rows /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=1)))
+            columns /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=0)))
             scaled = rows[:, None] * matrix * columns
         left, values, _ = np.linalg.svd(scaled)
         vectors: Values = left.conj().T * rows

@@ -106,10 +106,10 @@ class SecondOrder:
     @cached_property
     def poles(self) -> tuple[Values, ranks.Margin]:
         """Approximate nonzero poles, one of each conjugate pair, and the margin of the ranks."""
-        rigid, margin = self._null(self.K, self.D)
-        unloaded, other = self._null(self.K)
-        R = ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M / self.size))[0]
-        part = self.restricted(R / self.size[:, None])
+        scale = 1.0 / self.size
+        rigid, margin = ranks.null_space(ranks.stacked([[self.K], [self.D]]), scale)
+        unloaded, other = ranks.null_space(self.K, scale)
+        part = self.restricted(ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M), scale)[0])
         r = len(part.M)
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
@@ -123,11 +123,6 @@ class SecondOrder:
             found, zeros = np.concatenate((roots, -roots)), 2 * zeros
         found = found[np.argsort(np.abs(found))][zeros:]
         return found[found.imag >= 0.0], margin & other
-
-    def _null(self, *matrices: ranks.Noisy) -> tuple[Array, ranks.Margin]:
-        stack = ranks.stacked([[matrix] for matrix in matrices]) @ np.diag(1.0 / self.size)
-        basis, margin = ranks.null_space(stack)
-        return basis / self.size[:, None], margin.transformed(1.0 / self.size)
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
@@ -152,12 +147,12 @@ def second_order(lin: LinearModel) -> SecondOrder:
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # To find rounding errors, each entry of S is compared with the norm of its own column.
-    each = np.linalg.norm(S.values / size[:, None], axis=0)
+    each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
         K=ranks.without_rounding(K @ -N, size, size),
         D=ranks.without_rounding(D @ -np.eye(nv), size, size),
-        S=ranks.without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+        S=ranks.without_rounding(S, size, each),
     )
 
 
@@ -213,9 +208,9 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     nv, X, system = len(lin.M), rate_matrix(lin), second_order(lin)
     size = system.size
     pushes = ranks.stacked([[system.K.T], [system.D.T], [system.S.T]])
-    free, margin = ranks.null_space(pushes @ np.diag(1.0 / size), states=2)
+    free, margin = ranks.null_space(pushes, 1.0 / size, states=2)
     # A column of W^T is a unit vector if the momentum belongs to a single coordinate.
-    basis, pivots = ranks.echelon(free / size[:, None], size)
+    basis, pivots = ranks.echelon(free, size)
     W = basis.T
     momenta = W @ lin.M
     # Find the coordinates whose rates are the momenta.
@@ -238,7 +233,7 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
         T[nv + pivots, r:] = -np.linalg.solve(momenta[:, pivots], momenta[:, kept])
     zero = np.zeros((k, nv))
     L1, L2 = np.hstack((zero, momenta)), np.hstack((coordinates, zero))
-    return ConservedMomenta(W, L1, L2, kept, T, margin.transformed(1.0 / size))
+    return ConservedMomenta(W, L1, L2, kept, T, margin)
 
 
 # For each group of velocities: name of the momentum, and name of the coordinate whose rate is the

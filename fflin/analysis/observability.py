@@ -6,7 +6,7 @@ import numpy as np
 
 from fflin.analysis import mechanics
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.ranks import EPS, Noisy, RankAnalysis, echelon, without_rounding
+from fflin.analysis.ranks import EPS, Noisy, RankAnalysis, divisors, echelon, without_rounding
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, instance, positive
 from fflin.dynamics.integrators import held_cost
@@ -96,23 +96,21 @@ def observability(lin: LinearModel) -> Observability:
     """
     lin = mechanics.checked(lin)
     size, nv = np.tile(np.sqrt(lin.M.diagonal()), 2), len(lin.M)
-    source, found = mechanics.at_rest(lin), None
+    source, method, motions = mechanics.at_rest(lin), "eigenvalues", None
     if source is not None:
         system = mechanics.second_order(source)
         N = mechanics.rates_of_positions(mechanics.rate_matrix(source))
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
-        each = np.linalg.norm(C / size, axis=1)
-        units = np.where(each > 0.0, each, 1.0)
+        units = divisors(np.linalg.norm(C / size, axis=1))
         shown = without_rounding(Noisy(C, 4.0 * EPS * np.abs(C)), units, size)
         position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
-        found = unobservable(system, position, velocity, lin.dt)
-    if source is not None and found is not None:
-        motions, _, fixed = found
-        motions = np.vstack((N @ motions[:nv], motions[nv:]))
-        method = "eigenvalues" if system.acting else "closed form"
-    else:
+        if found := unobservable(system, position, velocity, lin.dt):
+            motions, _, fixed = found
+            motions = np.vstack((N @ motions[:nv], motions[nv:]))
+            method = "eigenvalues" if system.acting else "closed form"
+    if motions is None:
         # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
-        X, method = mechanics.rate_matrix(lin), "eigenvalues"
+        X = mechanics.rate_matrix(lin)
         _, motions, _, fixed = split_by_poles(X, lin.C.T, lin.M, lin.dt, dual=True)
     basis, _ = echelon(motions, size)
     nx, count = basis.shape

@@ -172,16 +172,26 @@ def right_vectors(
     return singular, vectors, rank, judged(singular / tolerance, vectors, rank, states)
 
 
+def divisors(sizes: Array) -> Array:
+    """Replace sizes of 0 by 1, so that vectors of size 0 stay 0 if they are divided by them."""
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank from singular values divided by the tolerance."""
     near = range(max(rank - 1, 0), min(rank + 1, len(ratios)))
     return Margin(tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near))
 
 
-def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
-    """Return an orthonormal basis (n, k) of the null space, and its margin; see `right_vectors`."""
-    _, vectors, rank, margin = right_vectors(*matrix, states)
-    return np.real(vectors[:, rank:]), margin
+def null_space(matrix: Noisy, scale: Array | float = 1.0, states: int = 1) -> tuple[Array, Margin]:
+    """Return a basis (n, k) of the null space, and its margin; see `right_vectors`.
+
+    The basis is orthonormal in coordinates that `scale` (n,) multiplies.
+    """
+    scales = np.broadcast_to(scale, matrix.values.shape[1])
+    values, noise = matrix.values * scales, matrix.noise * scales
+    _, vectors, rank, margin = right_vectors(values, noise, states)
+    return scales[:, None] * np.real(vectors[:, rank:]), margin.transformed(scales)
 
 
 def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:

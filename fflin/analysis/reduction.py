@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis import mechanics
-from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space
+from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, Indices, frozen
@@ -284,8 +284,8 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     if not len(free) or not wheel_speeds:
         return free
     forces = rigid_forces(without(lin.generator or lin, free))
-    sizes = np.linalg.norm(forces.values, axis=0)
-    idle = null_space(forces @ np.diag(1.0 / np.where(sizes > 0.0, sizes, 1.0)))[0]
+    sizes = divisors(np.linalg.norm(forces.values, axis=0))
+    idle = null_space(forces @ np.diag(1.0 / sizes))[0]
     motors = [lin.input_names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
     spun = image(idle[motors], _ROUNDING)[0]
     return np.delete(free, echelon(spun, np.ones(len(free)))[1])
@@ -319,7 +319,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 def rigid_forces(body: LinearModel) -> Noisy:
     """Return the input matrix (r, nu) of the rigid motions, on which no spring acts."""
     system = mechanics.second_order(body)
-    motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
+    motions, _ = null_space(system.K.T, 1.0 / system.size)
     return system.S.after(motions.T)
 
 
@@ -371,7 +371,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
         "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
-        "_drift": None if lin.drift is None else S @ lin.drift,
+        "drift": None if lin.drift is None else S @ lin.drift,
         "_inertia": partial(given, frozen(M)),
     }
 

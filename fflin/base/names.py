@@ -27,12 +27,8 @@ def input_keys(of: Any) -> tuple[str, ...]:
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the 12 + 2n states: first the configuration, then the velocity."""
-    return (
-        *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
-        *(f"q_m.{name}" for name in joints),
-        *(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"),
-        *(f"qdot_m.{name}" for name in joints),
-    )
+    groups = dict(q_b="xyz", r_b="xyz", q_m=joints, omega_b="xyz", v_b="xyz", qdot_m=joints)
+    return tuple(f"{group}.{name}" for group, names in groups.items() for name in names)
 
 
 def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:

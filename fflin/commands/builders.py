@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -180,11 +180,9 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
 
 
-def linear_model(
-    arguments: Namespace, robot: fflin.Robot | None = None
-) -> tuple[fflin.Robot, fflin.LinearModel]:
+def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
     """Return the robot and its linear model about the operating point of the arguments."""
-    robot = robot or load_robot(arguments)
+    robot = load_robot(arguments)
     return robot, model_about(robot, arguments, *point_of(robot, arguments))
 
 
@@ -261,50 +259,33 @@ def designed(
     """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
-    _, lin = linear_model(arguments, design)
+    lin = model_about(design, arguments, *point_of(design, arguments))
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
 
 
-def weights_of(arguments: Namespace) -> dict[str, dict[str, float]]:
-    """Return the weights of --q, --r and --bryson, or {} if none of these options is given."""
+def weights_of(arguments: Namespace) -> dict[str, object]:
+    """Return the rule of --weights, and the weights of --q, --r and --bryson."""
     names = ("q", "r", "bryson")
     given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
-    return given if any(given.values()) else {}
+    return {"rule": arguments.weights, **given}
 
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
     """Return the regulator of a model with the weights of the options; warn of small margins."""
     from fflin.control.gain import cautions
     from fflin.control.lqr import require_fixed_point
-    from fflin.control.weights import rule_weights
 
     require_fixed_point(lin)
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
-    given, speeds = weights_of(arguments), arguments.wheel_speeds
     try:
-        *QRN, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
+        gain = fflin.lqr(lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds)
     except UnknownNameError as error:
         hint = "; --no-allocate weights single thrusters" * allocated
         raise UnknownNameError(f"{error}{hint}") from None
-    gain = replace(fflin.lqr(lin, *QRN, wheel_speeds=speeds), weights=rule)
     for text in cautions(gain):
         warnings.warn(text, FflinWarning, stacklevel=2)
     return gain
-
-
-def schedule_of(
-    along: fflin.LinearTrajectory, arguments: Namespace, Qf: str | dict[str, float] = "steady"
-) -> fflin.GainSchedule:
-    """Return the time-varying regulator along a trajectory with the weights of the options."""
-    from fflin.control.default_weights import pace_along
-    from fflin.control.tvlqr import steady_end
-    from fflin.control.weights import rule_weights
-
-    sample, lin = arguments.sample, steady_end(along)
-    pace = pace_along(float(along.t[-1] - along.t[0]), sample or 0.0)
-    Q, R, _, rule = rule_weights(lin, arguments.weights, weights_of(arguments), pace=pace)
-    return fflin.tvlqr(along, Q, R, Qf, sample, rule=rule)
 
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
@@ -383,16 +364,11 @@ def about_point(
     else:
         lin = model_about(design, arguments, *point_of(design, arguments, "target_"))
     if arguments.mpc:
-        from fflin.control.default_weights import Pace
         from fflin.control.mpc import Mpc
-        from fflin.control.weights import rule_weights
 
-        # Q and R weight a cost integral, because `lin` is in continuous time. Their default values
-        # depend on the sample time.
-        given, pace = weights_of(arguments), Pace(hold=arguments.sample)
-        Q, R, *_ = rule_weights(lin, arguments.weights, given, pace=pace)
         settings = {"dt": arguments.sample, "limits": limits_of_options(arguments)}
-        by = fflin.mpc(lin, Q, R, horizon=arguments.horizon, **settings)
+        weights = weights_of(arguments)
+        by = fflin.mpc(lin, horizon=arguments.horizon, weights=weights, **settings)
         assert isinstance(by, Mpc)  # since the model is about a point
         return by, fflin.StateFeedback(by.lin, by.gain.K), None
     if arguments.controller:
@@ -438,7 +414,9 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     if arguments.schedule is None:
         models = models_along(arguments, robot)
-        return fflin.TrajectoryFeedback(models, schedule_of(models, arguments))
+        weights = weights_of(arguments)
+        schedule = fflin.tvlqr(models, sample=arguments.sample, weights=weights)
+        return fflin.TrajectoryFeedback(models, schedule)
     why = "the file of --schedule already contains the trajectory and the design of its gains"
     refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
     schedule = fflin.GainSchedule.load(arguments.schedule)

@@ -31,8 +31,8 @@ from fflin.commands.builders import (
     reference_of,
     refuse,
     robot_of_design,
-    schedule_of,
     state_of,
+    weights_of,
 )
 
 if TYPE_CHECKING:
@@ -82,7 +82,8 @@ def tvlqr(arguments: Namespace) -> Report:
     why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
-    schedule = schedule_of(along, arguments, once("--qf", arguments.qf) or "steady")
+    Qf = once("--qf", arguments.qf) or "steady"
+    schedule = fflin.tvlqr(along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments))
     text = str(schedule)
     if any(isinstance(each, fflin.Thruster) for each in along.robot.inputs):
         text += f"\n{folded([_NOT_ALLOCATED])}"
@@ -274,8 +275,8 @@ def sweep(arguments: Namespace) -> Report:
 
     path, robot = arguments.output_file, load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
-    q, v, u = _points(robot, arguments)
-    size = len(q) * ChunkJob(robot, at_rest=v is None and u is None, **settings).row_bytes
+    linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
+    size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
@@ -314,8 +315,6 @@ def _points(
         drawn = {"seed": arguments.seed, "ranges": ranges, "base": base}
         return fflin.random_configurations(robot, arguments.random, **drawn), v, u
     axes = once("--grid", arguments.grid)
-    for name in axes:
-        robot.joint(name)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
     joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
     others = {name: x for name, x in joints.items() if name not in axes or name in fixed}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import textwrap
 import warnings
 from argparse import Namespace
 from functools import partial
@@ -14,7 +13,7 @@ from pathlib import Path
 import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
 from fflin.base.names import runs
-from fflin.base.tables import counted, cut, folded, grid, matrix, signals, width
+from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.writing import check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
@@ -181,10 +180,8 @@ def check(arguments: Namespace) -> Report:
     example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
     """
     if arguments.trajectory:
-        from fflin.linear.check import held_to
-
         along = models_along(arguments)
-        robot, found = along.robot, held_to(arguments.tolerance, along.check())
+        robot, found = along.robot, along.check(tolerance=arguments.tolerance)
         text = f"{found}\n\n{along}"
     else:
         robot, lin = linear_model(arguments)
@@ -207,15 +204,14 @@ def model_report(lin: fflin.LinearModel) -> str:
     sampled = f", sampled every {lin.dt:g} s" if lin.dt else ""
     head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}{sampled}"
     head += f"; the operating point is {point}"
-    parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
+    parts = [folded([head, *_units(lin)])]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
     # Report poles only at an equilibrium: along a motion, they do not determine stability. If A A =
     # 0, all poles are zero and none is reported.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
-        shown = f"unstable poles (positive real part): {shown}"
-        parts.append(textwrap.fill(shown, width()))
+        parts.append(folded([f"unstable poles (positive real part): {shown}"]))
     vectors = (
         ("x0", lin.x0, lin.state_names, lin.state_units),
         ("u0", lin.u0, lin.input_names, lin.input_units),
@@ -242,8 +238,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     return "\n\n".join(parts)
 
 
-def _units(lin: fflin.LinearModel) -> str:
-    """Return the units of states, inputs and outputs as text, one unit per group of names."""
+def _units(lin: fflin.LinearModel) -> list[str]:
+    """Return a line with the units of the states, inputs or outputs, one per group of names."""
     signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units
@@ -253,8 +249,8 @@ def _units(lin: fflin.LinearModel) -> str:
             f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
             for first, last, group, of in runs(names, units)
         )
-        lines.append(textwrap.fill(f"{title}: {groups}", width(), subsequent_indent="   "))
-    return "\n".join(lines)
+        lines.append(f"{title}: {groups}")
+    return lines
 
 
 def _rate(unit: str) -> str:

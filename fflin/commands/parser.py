@@ -142,9 +142,8 @@ def one(
     default: float | str | None = None,
     **more: object,
 ) -> Form:
-    """Return the form of an option with one value, or one value for each name in `metavar`."""
-    size = {"nargs": len(metavar)} if isinstance(metavar, tuple) else {}
-    return {"type": reader, "metavar": metavar, "default": default, **size, **more}
+    """Return the form of an option that is given once."""
+    return {"type": reader, "metavar": metavar, "default": default, **more}
 
 
 def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
@@ -161,7 +160,7 @@ _PAIRS = many(assignment, "NAME=VALUE")
 _WEIGHTS = many(assignment, "NAME=W")
 _OF_JOINT = many(joint_or_all, "[NAME=]VALUE")
 _NAMES = many(str, "NAME")
-_ANGLES, _AXES = one(number, ("R", "P", "Y")), one(number, ("X", "Y", "Z"))
+_ANGLES, _AXES = one(number, ("R", "P", "Y"), nargs=3), one(number, ("X", "Y", "Z"), nargs=3)
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
 _FORMER: Form = {**_TIME, "dest": "former_dt"}

@@ -12,7 +12,6 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
 from fflin.kernel import loop as rules
-from fflin.kernel.loop import PULSES, WHEELS, Pulses, Wheels
 from fflin.kernel.tree import empty
 from fflin.robot.fields import Range, input_limits, pulsed_thrusters
 from fflin.robot.inputs import named_inputs
@@ -26,14 +25,13 @@ class Saturation(NamedTuple):
 
     low: Array  # (nu,)
     high: Array
-    wheels: Wheels = empty(WHEELS)
-    pulses: Pulses = empty(PULSES)
+    wheels: rules.Wheels = empty(rules.WHEELS)
+    pulses: rules.Pulses = empty(rules.PULSES)
 
     @property
     def cuts(self) -> bool:
-        """Whether the applied inputs may differ from the command."""
-        limited = bool(np.isfinite((self.low, self.high)).any())
-        return limited or len(self.wheels.at) + len(self.pulses.at) > 0
+        """Whether inputs may differ from continuous commands, which are never pulsed."""
+        return bool(np.isfinite((self.low, self.high)).any() or len(self.wheels.at))
 
 
 def saturation(
@@ -51,7 +49,7 @@ def saturation(
         at, of_v = [names.index(x) for x in spun], [robot.joint(x).idx_v for x in spun]
         mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[of_v]
         least_speed, most_speed = np.array([limits[f"qdot_m.{name}"] for name in spun]).T
-        wheels = Wheels(
+        wheels = rules.Wheels(
             at=np.array(at),
             row=np.array([6 + robot.joint_names.index(name) for name in spun]),
             least_torque=low[at],
@@ -120,11 +118,6 @@ class Law:
     # not finite raises no error.
     slow: float
 
-    @property
-    def advance(self) -> Callable[..., None] | None:
-        """Method that integrates the policy's own state, or None if the policy has no state."""
-        return getattr(self.policy, "advance", None)
-
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
@@ -155,16 +148,13 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
     slots = delay // sample + 1 if sample else 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
-        low=limits.low,
-        high=limits.high,
+        **limits._replace(pulses=limits.pulses._replace(**fresh))._asdict(),
         held=initial.copy(),
         pending=np.zeros(slots * len(initial)),
         slots=slots,
         sample=sample,
         delay=np.array([float(delay)]),
         fresh=np.zeros(1),
-        wheels=limits.wheels,
-        pulses=limits.pulses._replace(**fresh),
     )
     rules.limit(channel, channel.held)
     return channel
@@ -179,7 +169,7 @@ def channelled(
     the wheels whose speed is limited.
     """
     wheels, u = len(limits.wheels.at), initial.copy()
-    if not (sample or wheels or np.isfinite((limits.low, limits.high)).any()):
+    if not (sample or limits.cuts):
         return lambda _, *point: law(*point)
     within = limits._replace(wheels=limits.wheels._replace(row=np.arange(wheels)))
     channel = channel_of(within, initial, sample, delay)

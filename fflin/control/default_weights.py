@@ -62,7 +62,7 @@ class Pace(NamedTuple):
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0  # factor on the design displacements
-    hold: float = 0.0  # [s], hold time of the inputs of a continuous model
+    hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
     held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
@@ -157,8 +157,8 @@ def _of_inertia(
     if loaded:
         growth, mode = _growth(lin)
         limit = max(limit, (_OF_GROWTH * growth, mode))
-    if hold := pace.hold or lin.dt:
-        limit = min(limit, (float(pace.held / (hold * rates[-1])), "the sampling time"))
+    if pace.hold:
+        limit = min(limit, (float(pace.held / (pace.hold * rates[-1])), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 

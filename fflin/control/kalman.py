@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
 from fflin.analysis.reduction import outputs_of, regulated_part, selection
-from fflin.base.errors import DetectabilityError, InputError, listed
+from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
@@ -388,11 +388,8 @@ def tvkalman(
 
     if asks_steady(P0, "P0", "a covariance"):
         lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
-        try:
+        with located("give P0, because no steady filter exists at the start of the trajectory"):
             P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
-        except (DetectabilityError, InputError) as error:
-            said = f"no steady filter exists at the start of the trajectory: {error}; or give P0"
-            raise type(error)(said) from None
     else:
         P = weight("P0", P0, traj.state_names)
     held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -15,13 +15,13 @@ import numpy as np
 
 from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.record import FORMATS, read_record, reading, texts
-from fflin.base.validation import Array, ArrayLike, Mask, as_double, instance, number, shaped
+from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, Sample, decider, feedback_of
+from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
-from fflin.linear.fit import require_sensed
+from fflin.linear.fit import about_point, require_fit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -120,15 +120,12 @@ class LinearController(Feedback):
     system: Any
     lin: LinearModel
     sign: float = field(default=1.0, kw_only=True)
-    noise: Callable[[float], ArrayLike] | None = field(default=None, kw_only=True)
+    noise: Noise | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError(
-                f"sign is {self.sign!r} and lin.moving is {lin.moving}, expected sign 1 or -1 and "
-                "a model about a fixed point, with moving False"
-            )
+        lin = about_point(self.lin)
+        if number("sign", self.sign) not in (1.0, -1.0):
+            raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _system_of(self.system)
@@ -176,7 +173,7 @@ class LinearController(Feedback):
             If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
         lin, terms, state = self.lin, self.terms(), self.state_map(robot)
-        require_sensed(lin, state)
+        require_fit(lin, robot, state, sensed=True)
         always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
         return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
 
@@ -215,10 +212,8 @@ def growing(policy: object) -> tuple[str, ...]:
     if not isinstance(by, LinearController):
         return ()
     hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
-    for what, matrix, advice in (
-        ("linear loop", by.loop, hint),
-        ("controller by itself", by.system.A, ""),
-    ):
+    systems = ("linear loop", by.loop, hint), ("controller by itself", by.system.A, "")
+    for what, matrix, advice in systems:
         poles = np.linalg.eigvals(matrix)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
@@ -227,13 +222,12 @@ def growing(policy: object) -> tuple[str, ...]:
     return tuple(said)
 
 
-def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
-    """Return the closed-loop matrix, dt [s] and state names, or None if the loop is not linear."""
+def closed_loop(policy: object) -> tuple[Array, float] | None:
+    """Return the closed-loop matrix and dt [s], or None if the loop is not linear."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):
-        own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
-        return by.loop, by.dt, (*by.lin.state_names, *own)
-    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)
+        return by.loop, by.dt
+    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt)
 
 
 class OutputFeedback(LinearController):
@@ -268,10 +262,7 @@ class OutputFeedback(LinearController):
     """
 
     def __init__(
-        self,
-        lin: LinearModel,
-        compensator: Compensator,
-        noise: Callable[[float], ArrayLike] | None = None,
+        self, lin: LinearModel, compensator: Compensator, noise: Noise | None = None
     ) -> None:
         instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
         super().__init__(compensator, lin, noise=noise)

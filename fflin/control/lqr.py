@@ -15,9 +15,10 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array, ArrayLike, dimension, instance
+from fflin.control.default_weights import Pace
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
-from fflin.control.weights import Weight, cost_weights, rule_weights, weight
+from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
 from fflin.linear.model import LinearModel
 
 # A relative residual above _COARSE raises a warning, and one above _USELESS raises an error.
@@ -30,7 +31,7 @@ def lqr(
     R: Weight | None = None,
     N: ArrayLike | None = None,
     *,
-    weights: str | None = None,
+    weights: Rule | None = None,
     wheel_speeds: bool | None = None,
 ) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
@@ -77,10 +78,12 @@ def lqr(
         Weight on the inputs, positive definite, in the same forms as Q.
     N : array_like (nx, nu), optional
         Cross weight. Q - N R^-1 N' must be positive semidefinite.
-    weights : {"urdf", "identity"}, optional
+    weights : {"urdf", "identity"} or mapping, optional
         Rule for the weights if Q and R are omitted. The rule "urdf" (default) respects the limits
-        of the URDF. The rule "identity" gives each state and input a weight of 1. For a sampled
-        model, the rule defines the continuous-time cost, which `sampled_cost` converts.
+        of the URDF. The rule "identity" gives each state and input a weight of 1. A mapping has the
+        keys of `weights` in `Robot.replace`: ``q``, ``r`` and ``bryson`` replace single weights of
+        the ``rule``. For a sampled model, the rule defines the continuous-time cost, which
+        `sampled_cost` converts.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the operating point. By default,
         wheel speeds are regulated if inputs other than the wheels can change them. If True,
@@ -128,7 +131,7 @@ def lqr(
     require_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
+        Q, R, N, rule = rule_weights(lin, weights, Pace(hold=lin.dt), wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, cross = cost_weights(lin, Q, R, N)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import NamedTuple, TypeAlias
@@ -20,7 +20,7 @@ from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
-from fflin.control.weights import Weight, sampled_cost, weight
+from fflin.control.weights import Rule, Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
@@ -28,7 +28,7 @@ from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
 # Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
-Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, str | None]"
+Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
 # Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
 _MOST_ENTRIES = 20_000_000
@@ -60,7 +60,7 @@ def mpc(
     dt: float | None = None,
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
-    weights: str | None = None,
+    weights: Rule | None = None,
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
@@ -102,7 +102,7 @@ def mpc(
     Qf : "steady", or as Q
         Weight on the error after N samples, or at the end of a trajectory. "steady" is the cost
         to go of the regulator from the end of the horizon on.
-    weights : {"urdf", "identity"}, optional
+    weights : {"urdf", "identity"} or mapping, optional
         Rule for the weights if Q and R are omitted, as in `lqr`.
 
     Returns
@@ -155,9 +155,8 @@ def mpc(
     return _about(source, ahead, (Q, R, Qf, weights))
 
 
-class _Predictive:
+class _Predictive(Feedback):
     horizon: Horizon
-    deviation: Callable[[Robot], Deviation]
 
     def __repr__(self) -> str:
         by = self.horizon
@@ -189,7 +188,7 @@ class _Predictive:
 
 
 @dataclass(eq=False, repr=False)
-class Mpc(_Predictive, Feedback):
+class Mpc(_Predictive):
     """Model predictive controller about a point.
 
     Attributes
@@ -240,10 +239,6 @@ def _unplanned(
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
-    if (least := low > high).any():
-        raise InputError(
-            f"the lower limit of {names[least.argmax()]} is above its upper limit; correct limits="
-        )
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
     if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
         raise InputError(
@@ -414,9 +409,8 @@ class Receding:
     `at(t, q, v)` returns the inputs u* of the reference and the error e.
     """
 
-    def __init__(self, horizon: Horizon, at: Deviation | None = None) -> None:
+    def __init__(self, horizon: Horizon, at: Deviation) -> None:
         self.of, self._at, self._last = horizon, at, -np.inf
-        self._stages: tuple[Stage, ...] = ()
         self.solves = self.unfinished = 0
         # For each kind of soft-limit violation: the number of violations, and the magnitude and
         # description of the largest.
@@ -424,6 +418,7 @@ class Receding:
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
         if horizon.limited:  # now, so that the first sample is not slower
             self._change(horizon.window(0.0))
+            self._start()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -444,7 +439,6 @@ class Receding:
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
         self._last = next_sample(t, self._last, self.of.dt)
-        assert self._at is not None
         u, e = self._at(t, q, v)
         command: Array = u + self.step(t, e)
         return command
@@ -457,6 +451,7 @@ class Receding:
             return d
         if stages[0] is not self._stages[0]:
             self._change(stages)
+            self._model.update(A=self._rows)
         free = self._free @ e
         self.solves += 1
         if self._due:  # the robot may exceed soft limits because it differs from the model
@@ -504,7 +499,7 @@ class Receding:
         self._violations[what] = count + bool(fractions[row] > least), most, said
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
-        fresh, self._stages = not self._stages, stages
+        self._stages = stages
         rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
         low, high, self._soft = self.of.bounds(stages)
         self._G, self._free = rows[:, :size], rows[:, size:]
@@ -516,10 +511,6 @@ class Receding:
         width = width[np.isfinite(width)]
         self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
         self._rows = self._G * self._unit[:, None]
-        if fresh:
-            self._start()
-        else:
-            self._model.update(A=self._rows)
 
     def _start(self) -> None:
         self._model = optional_package("daqp", "this needs the solver DAQP", "mpc").Model()

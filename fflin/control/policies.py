@@ -17,13 +17,16 @@ from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.kernel.allocation import nearest
-from fflin.linear.fit import require_fit, require_turns
+from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+# Function of time that returns measurement noise (ny,).
+Noise: TypeAlias = Callable[[float], ArrayLike]
 
 # Function of t, q and v that returns the inputs u* of a reference, and the error e relative to it.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
@@ -92,14 +95,8 @@ class StateFeedback(Feedback):
     K: Array
 
     def __post_init__(self) -> None:
-        instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if self.lin.moving:
-            raise InputError(
-                "the model is about a moving reference, expected one about a fixed point; follow "
-                "a moving reference with TrajectoryFeedback"
-            )
         hint = " (nu, nx); give the gain that was designed for this model"
-        self.K = frozen(shaped("K", self.K, self.lin.B.shape[::-1], hint))
+        self.K = frozen(shaped("K", self.K, about_point(self.lin).B.shape[::-1], hint))
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
@@ -172,15 +169,14 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        self._design, self._robot = (
-            Actuation(StateMap(each, reference=reference, frame=frame))
-            for each in (allocation.design, robot)
-        )
+        design = StateMap(allocation.design, reference=reference, frame=frame)
+        self._design = Actuation(design)
+        self._robot = Actuation(StateMap(robot, reference=reference, frame=frame))
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
-        self.advance = self._command.advance
+        self.advance: Callable[..., None] | None = getattr(inner, "advance", None)
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 
@@ -247,6 +243,10 @@ Measure: TypeAlias = Callable[[Array], Array]
 # Function of a controller's state z that returns the command, and the next z or dz/dt.
 Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
 
+# Function of time that returns a compensator's step, the robot's outputs, and the state near which
+# angles are unwrapped.
+At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
+
 
 class Sample(NamedTuple):
     """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
@@ -275,18 +275,12 @@ class Sample(NamedTuple):
 class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
-    The compensator's state z advances at each sample, or at each stage if dt is 0. ``at(t)``
-    returns the compensator's step, the robot's outputs, and the state near which angles are
-    unwrapped. `sizes` are the sizes of z and y.
+    The compensator's state z advances at each sample, or at each stage if dt is 0. `sizes` are the
+    sizes of z and y.
     """
 
     def __init__(
-        self,
-        state: StateMap,
-        dt: float,
-        sizes: tuple[int, int],
-        at: Callable[[float], tuple[Step, Measuring, Array]],
-        noise: Callable[[float], ArrayLike] | None = None,
+        self, state: StateMap, dt: float, sizes: tuple[int, int], at: At, noise: Noise | None = None
     ) -> None:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.estimate: Array = np.zeros(nz)  # z at the next sample or stage

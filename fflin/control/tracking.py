@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -25,9 +25,6 @@ from fflin.robot.robot import Robot
 
 # A time up to this factor times the end counts as the end, because sums of time steps are rounded.
 AT_THE_END = 1.0 + 1e-9
-
-# Function that returns q, v and u, in the policy's axes, at a time of the run.
-Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
 
 @dataclass(eq=False)
@@ -89,10 +86,7 @@ class TrajectoryFeedback(Feedback):
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return the reference q, v, and u in base axes at time t of the run."""
-        return self._point(t, self.duration * AT_THE_END)
-
-    def _point(self, t: float, over: float) -> tuple[Array, Array, Array]:
-        if t > over:
+        if t > self.duration * AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         first, last = self.trajectory.t[[0, -1]].tolist()
         return self.trajectory.point(min(first + max(t, 0.0), last))
@@ -115,9 +109,11 @@ class TrajectoryFeedback(Feedback):
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, u of the trajectory point to which the command at run time t refers."""
-        q, v, u = self._point(t, self.over)
-        if self.ahead and t <= self.over:
-            u = self._point(min(t + self.ahead, self.duration), self.duration)[2]
+        if t > self.over:
+            return self.reference(np.inf)
+        q, v, u = self.reference(t)
+        if self.ahead:
+            u = self.reference(min(t + self.ahead, self.duration))[2]
         return q, v, u
 
     @cached_property
@@ -217,12 +213,6 @@ def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
     if held and isinstance(policy, LinearController):
         return policy.sampled(held)
     return policy
-
-
-def reference_of(policy: object) -> Reference | None:
-    """Return the reference of a policy that follows a motion, or None."""
-    found = getattr(decider(policy), "reference", None)
-    return found if callable(found) else None
 
 
 def tracking_of(policy: object) -> TrajectoryFeedback | None:

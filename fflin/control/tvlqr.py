@@ -20,7 +20,7 @@ from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import lqr
 from fflin.control.optimal import differential_riccati as riccati
-from fflin.control.weights import Weight, cost_weights, rule_weights, sampled_cost, weight
+from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import StateMap
 from fflin.linear.equilibrium import equilibrium
@@ -249,7 +249,7 @@ def tvlqr(
     Qf: Weight | str = "steady",
     sample: float | None = None,
     *,
-    weights: str | None = None,
+    weights: Rule | None = None,
     rule: str = "as given",
 ) -> GainSchedule:
     r"""Return the time-varying linear quadratic regulator along a trajectory.
@@ -284,10 +284,11 @@ def tvlqr(
         see `momentum_reduction`.
     sample : float, optional
         Sampling time [s], which must divide the duration.
-    weights : {"urdf", "identity"}, optional
-        Rule for the weights if Q and R are omitted. The rule of `lqr` is applied to the linear
-        model at the last point of the trajectory, with two changes: the limits are checked for
-        displacements a tenth as large, and errors decay within the duration of the trajectory.
+    weights : {"urdf", "identity"} or mapping, optional
+        Rule for the weights if Q and R are omitted, in the same forms as in `lqr`. The rule is
+        applied to the linear model at the last point of the trajectory, with two changes: the
+        limits are checked for displacements a tenth as large, and errors decay within the duration
+        of the trajectory.
     rule : str
         Description of the rule that set Q and R.
 
@@ -324,7 +325,7 @@ def tvlqr(
     names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace=pace)
+        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace)
     elif weights is not None or Q is None or R is None:
         raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, _ = cost_weights(traj, Q, R, None)
@@ -332,7 +333,7 @@ def tvlqr(
 
     def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)
-        return np.array((A, riccati.spread(B, R), np.broadcast_to(Q, A.shape)))
+        return np.array((A, B @ np.linalg.solve(R, B.mT), np.broadcast_to(Q, A.shape)))
 
     residual = 0.0
     with riccati.bounded_by("smaller weights or a larger R"):

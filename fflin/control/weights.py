@@ -15,7 +15,7 @@ from fflin.analysis.reduction import (
     selection,
     without,
 )
-from fflin.base.errors import InputError, listed, unknown
+from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, numbers, positive, shaped
 from fflin.control.default_weights import Pace, default_weights
@@ -24,6 +24,9 @@ from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
+
+# Rule for the weights: its name, or a mapping with the keys of `weights` in `Robot.replace`.
+Rule: TypeAlias = str | Mapping[str, object]
 
 # A weight from the user, its name or pattern, and whether it was given as a largest value (Bryson).
 _Given: TypeAlias = tuple[float, str, bool]
@@ -249,34 +252,25 @@ def _diagonal(
 
 
 def rule_weights(
-    lin: LinearModel,
-    name: str | None,
-    given: Mapping[str, Mapping[str, float]] | None = None,
-    *,
-    wheel_speeds: bool | None = None,
-    pace: Pace | None = None,
+    lin: LinearModel, given: Rule | None, pace: Pace, wheel_speeds: bool | None = None
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N by a rule, and a description of the rule.
-
-    `given` weights replace weights of the rule.
-    """
+    """Return Q, R and N by a rule with given weights, and a description of the rule."""
     # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
     # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
     # the rule; if they do not, it is "urdf".
-    source = lin.generator or lin
-    own = lin.weights if name is None else {}
-    name = own.get("rule", name)
+    source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
+    require_known("part of weights", given, ("rule", "q", "r", "bryson"))
+    own = lin.weights if given.get("rule") is None else {}
+    name = own.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(lin.B.shape))
     if name is None or name == "urdf":
-        pace = pace or Pace()
-        pace = pace._replace(hold=lin.dt or pace.hold)
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "1 for every state and every input (identity)"
     else:
-        raise unknown("rule of weights", name, ("urdf", "identity"))
-    if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given or {}):
+        raise unknown("rule of weights", str(name), ("urdf", "identity"))
+    if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
         # A common factor of Q and R does not change the gain. The rule's weights are scaled so that
         # the largest values of the named states and inputs cost 1, as in Bryson's rule.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
@@ -331,7 +325,7 @@ def _of_regulated(
 
 
 def _weights_of(
-    lin: LinearModel, given: Mapping[str, Mapping[str, float]], *, of_robot: bool = False
+    lin: LinearModel, given: Mapping[str, object], *, of_robot: bool = False
 ) -> dict[int, _Given]:
     """Return the given weights by index; the indices of inputs follow the indices of states."""
     states, inputs = lin.state_names, input_keys(lin)

@@ -81,7 +81,7 @@ class Aba:
             by_q, by_v, by_force = self._constrained_derivatives(q, v, external, tau, state.S)
         else:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
-            by_q, by_v, by_force = (state.velocities(slope.T).T for slope in slopes)
+            by_q, by_v, by_force = state.velocities(np.array(slopes).mT).mT
             by_q, by_v = state.columns(by_q), state.columns(by_v)
             by_force = state.velocities(by_force)
         self.inverse = by_force

@@ -81,13 +81,16 @@ def _axes_of(**units: str) -> dict[str, str]:
     return {f"{name}.{axis}": unit for name, unit in units.items() for axis in "xyz"}
 
 
+_POSE, _TWIST = _axes_of(q_b="1", r_b="m"), _axes_of(omega_b="rad/s", v_b="m/s")
+
+
 def state_units(robot: Robot) -> dict[str, str]:
     """Return the names and units of the 12 + 2n states as {name: unit}."""
     q_m, qdot_m = dict[str, str](), dict[str, str]()
     for joint in robot.joints:
         unit = joint.unit
         q_m[f"q_m.{joint.name}"], qdot_m[f"qdot_m.{joint.name}"] = unit, f"{unit}/s"
-    return _axes_of(q_b="1", r_b="m") | q_m | _axes_of(omega_b="rad/s", v_b="m/s") | qdot_m
+    return _POSE | q_m | _TWIST | qdot_m
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
@@ -131,7 +134,7 @@ class Chart:
     def J(self) -> Array:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
         # Q^-1 = Q^T + q_b q_b^T / q0.
-        return 2.0 * (2.0 * self.N.mT + self._over_q0(self.q_b))
+        return 2.0 * (2.0 * self.N.mT + self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
@@ -143,10 +146,9 @@ class Chart:
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
-        return -0.5 * (crossed if self.standing else crossed + self._over_q0(omega))
-
-    def _over_q0(self, omega: Array) -> Array:
-        return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
+        if self.standing:
+            return -0.5 * crossed
+        return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def over_q_b(self, by_turn: Array) -> Array:
         """Convert derivatives (.., k, 3) over base rotations to derivatives over q_b (1.3)."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ _integrate = pin.integrate
 
 def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
     """Displace configurations (N, nq) by tangent vectors (N, nv), and return the results."""
-    return np.array([_integrate(model, *each) for each in zip(q, way, strict=True)])
+    return np.array([*map(partial(_integrate, model), q, way)])
 
 
 class Integrator:

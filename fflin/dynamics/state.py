@@ -281,7 +281,7 @@ class StateMap:
         chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ turning.product_matrix(turning.conjugate(self.origin_quaternion)).T
+        turned = relative @ turning.product_matrix(self.origin_quaternion)
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles * self._scale[6:]
@@ -396,7 +396,7 @@ class Actuation:
                 if rows in state.in_reference:
                     held.append(slice(at, at + 3))
             elif isinstance(item, kinds.JointTorque):
-                index = robot.joints.index(robot.joint(item.joint))
+                index = robot.joint_names.index(item.joint)
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:

@@ -194,11 +194,8 @@ class CLaw:
     ) -> None:
         source = as_path(folder).resolve()
         self._made = partial(CLaw, source, name=name, compiler=compiler)
-        found = [
-            path.stem
-            for path in source.glob("*.json")
-            if path.with_suffix(".c").is_file() and name in (None, path.stem)
-        ]
+        pairs = [path.stem for path in source.glob("*.json") if path.with_suffix(".c").is_file()]
+        found = [each for each in pairs if name in (None, each)]
         if len(found) != 1:
             raise FileError(
                 f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
@@ -296,20 +293,16 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
     """Compile a source file, and return its shared library."""
     if not isinstance(compiler, str) or "\0" in compiler:
         raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
-    command = shutil.which(compiler)
-    if command is None:
+    found = shutil.which(compiler)
+    if found is None:
         raise MissingPackageError(
             f"there is no C compiler '{compiler}'; install one, such as gcc, or give compiler="
         )
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "law.so"
         flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
-        done = subprocess.run(
-            [command, *flags, "-o", str(library), str(source), "-lm"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        command = [found, *flags, "-o", str(library), str(source), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
             raise InputError(f"{source}: cannot be compiled: {line}")

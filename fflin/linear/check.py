@@ -1,23 +1,26 @@
 """Check of A and B by ABA derivatives and by finite differences of the nonlinear model."""
 
-from collections.abc import Iterable, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import skew
+from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, frozen, instance, share
+from fflin.base.validation import Array, Mask, frozen, instance, share
+from fflin.dynamics import coordinates
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart
+from fflin.dynamics.integrators import integrate_rows
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_fit, require_sensed
+from fflin.linear.fit import require_fit
 from fflin.linear.model import Certificate, LinearModel, refuse_sampled
-from fflin.linear.nonlinear import Nonlinear, jacobian
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
@@ -64,6 +67,15 @@ _LOOSEST = 1e-2
 # Errors are therefore relative to a scale that includes this fraction of such terms. The fraction
 # is so small that the scale does not hide larger errors.
 _ROUNDING_FRACTION = 1e-3
+
+
+# Base speed [m/s] whose rounding errors would hide the other velocities. A faster base is described
+# relative to an observer that moves with it.
+_FAST = 100.0
+
+# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
+# h^6 f^(7) / 140.
+_WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
 @dataclass(frozen=True)
@@ -168,32 +180,33 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     refuse_sampled(lin.dt, "check")
-    return held_to(tolerance, _checked(robot, lin))
+    return check_all(robot, [lin], tolerance=tolerance)
 
 
-def held_to(tolerance: float | None, found: Check) -> Check:
-    """Replace all tolerances of a check by `tolerance`; with None, return the check unchanged."""
-    if tolerance is None:
-        return found
-    rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
-    return Check(rows, f"{found.title}, each error at most {tolerance:.1e}")
-
-
-def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
-    """Check many models; keep the row with the largest error / tolerance for each comparison."""
+def check_all(
+    robot: Robot, models: Iterable[LinearModel], title: str = "", *, tolerance: float | None = None
+) -> Check:
+    """Check models; of each comparison, keep the row with the largest error / tolerance."""
+    if tolerance is not None:
+        tolerance = share("tolerance", tolerance)
     worst: dict[tuple[str, str], Row] = {}
     for lin in models:
-        for row in _checked(robot, lin).rows:
-            before = worst.setdefault((row.test, row.block), row)
-            if not row.error * before.tolerance <= before.error * row.tolerance:
-                worst[row.test, row.block] = row
+        for test, errors, allowed in _comparisons(robot, lin):
+            for block, error in errors.items():
+                row = Row(test, block, error, tolerance or allowed)
+                before = worst.setdefault((test, block), row)
+                if not row.error * before.tolerance <= before.error * row.tolerance:
+                    worst[test, block] = row
+        condition = scaled_condition(inertia_matrix(robot, lin))
+        title = title or f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
+    title += "" if tolerance is None else f", each error at most {tolerance:.1e}"
     return Check(tuple(worst.values()), title)
 
 
-def _checked(robot: Robot, lin: LinearModel) -> Check:
+def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str, float], float]]:
+    """Yield the name, the errors {block: error} and the tolerance of each comparison."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    require_fit(lin, robot, state, whole=True)
-    require_sensed(lin, state)
+    require_fit(lin, robot, state, whole=True, sensed=True)
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
     aba, M = Aba(state), inertia_matrix(robot, lin)
     A, B, aba_inverse = aba_route(aba, q, v, lin.u0, moving=lin.moving)
@@ -206,40 +219,47 @@ def _checked(robot: Robot, lin: LinearModel) -> Check:
     # estimated from the error of its M^-1, which is the residual of M M^-1 = I.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
-    rows = _rows("ABA derivatives", scales.errors(A, B), by_aba)
+    yield "ABA derivatives", scales.errors(A, B), by_aba
 
-    model, nx, steps = Nonlinear(aba, lin), state.nx, scales.difference_steps()
+    model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
+    # The accelerations of light, aligned links change over small rotations. The step of a finite
+    # difference is smaller than these rotations.
+    steps = np.full(nx + len(lin.u0), 2e-4)
+    # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
+    steps[g.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
+    # f is quadratic in the velocities and linear in the inputs, so these steps can be large without
+    # a truncation error.
+    speed = np.abs(lin.x0[-nv:])
+    steps[nv:nx] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
+    steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
+    steps[nx:] = max(1.0, _largest(lin.f0[-nv:] / scales.mobility)) / scales.input_mobility
     # f is at most quadratic in every variable except the attitude and the joint positions.
     bends = np.zeros(len(point), dtype=bool)
-    bends[state.groups.q_b] = bends[state.groups.q_m] = True
+    bends[g.q_b] = bends[g.q_m] = True
     slopes = jacobian(model.rates, point, steps, bends)
     rounding = _STEP_ULPS * _EPS / difference
     errors = scales.errors(slopes[:, :nx], slopes[:, nx:], steps=steps[:nx], rounding=rounding)
-    rows += _rows("differences", errors, difference)
-    rows += _rows("outputs", _output_errors(model, lin, steps, difference), difference)
-    rows.append(Row("flow", "f", model.flow_error(), difference))
+    yield "differences", errors, difference
+    yield "outputs", _output_errors(model, lin, steps, difference), difference
+    yield "flow", {"f": model.flow_error()}, difference
 
-    x0 = state.to_state(q, v, near=lin.x0)
-    rows.append(Row("point", "x0", _largest(lin.x0 - x0) / max(1.0, _largest(x0)), route))
-    rows += _rows("point", scales.rate_errors(model.rates(point[None])[0]), route)
+    x0 = state.read(q, v, near=lin.x0)
+    yield "point", {"x0": _largest(lin.x0 - x0) / max(1.0, _largest(x0))}, route
+    f0, sizes = model.rates(point[None])[0], np.append(np.ones(nv), scales.mobility * scales.push)
+    for name, part in g._asdict().items():
+        size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
+        yield "point", {f"f0[{name}]": _largest(lin.f0[part] - f0[part]) / size}, route
 
     # If the inputs are the default ones, the lower half of B is M^-1.
     inverse = lin.B[-len(M) :] if aba.actuation.default else inverse_inertia(state, lin)
     scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
     scaled = scale[:, None] * inverse * scale
     least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
-    rows += [
-        Row("inertia", "M", _largest(lin.M - M) / _largest(M), route),
-        Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), route),
-        Row("inertia", "M^-1 symmetric", float(np.abs(scaled - scaled.T).max()), 1e-12),
-        Row("inertia", "M^-1 positive", max(0.0, -least), 1e-12),
-    ]
-    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
-
-
-def _rows(test: str, errors: Mapping[str, float], tolerance: float) -> list[Row]:
-    return [Row(test, block, error, tolerance) for block, error in errors.items()]
+    yield "inertia", {"M": _largest(lin.M - M) / _largest(M)}, route
+    yield "inertia", {"M M^-1 = I": inertia_residual(M, inverse)}, route
+    yield "inertia", {"M^-1 symmetric": _largest(scaled - scaled.T)}, 1e-12
+    yield "inertia", {"M^-1 positive": max(0.0, -least)}, 1e-12
 
 
 def _output_errors(
@@ -248,22 +268,22 @@ def _output_errors(
     """Return the errors of C, D and y0, compared with differences of the nonlinear outputs."""
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
-        errors = {"y0": lin.y0 - lin.x0, "C": lin.C - np.eye(nx), "D": lin.D}
-    else:
-        measuring, point = Measuring(state, lin.q), np.concatenate((lin.x0, lin.u0))
+        of_C = _largest(lin.C - np.eye(nx))
+        return {"y0": _largest(lin.y0 - lin.x0), "C": of_C, "D": _largest(lin.D)}
+    measuring, point = Measuring(state, lin.q), np.concatenate((lin.x0, lin.u0))
 
-        def y(z: Array) -> Array:
-            _, q, v, a = model.accelerations(z)
-            return np.array([measuring(*each) for each in zip(z[:, :nx], q, v, a, strict=True)])
+    def y(z: Array) -> Array:
+        _, q, v, a = model.accelerations(z)
+        return np.array([measuring(*each) for each in zip(z[:, :nx], q, v, a, strict=True)])
 
-        here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
-        errors = {"y0": (lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-        # A derivative is only noise if it is smaller than the rounding error of y / step.
-        noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
-        for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
-            largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
-            errors[name] = (given - slopes[:, part]) / np.maximum(largest, noise[:, part])
-    return {name: _largest(error) for name, error in errors.items()}
+    here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
+    errors = {"y0": _largest(lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
+    # A derivative is only noise if it is smaller than the rounding error of y / step.
+    noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
+    for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
+        largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
+        errors[name] = _largest((given - slopes[:, part]) / np.maximum(largest, noise[:, part]))
+    return errors
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
@@ -327,7 +347,8 @@ def aba_route(
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
-    there = own.jacobians(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
+    (rates,) = state.velocities(aba.accelerations(at_origin[None], v[None], u[None]))
+    there = own.jacobians(q, nu, u, rates)
     # Upper half of A: kinematics of a small displacement, in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
@@ -351,10 +372,11 @@ class Scales:
         self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         # Mobilities: sqrt((M^-1)_ii) (6 + n,) of each coordinate, and sqrt(b^T M^-1 b) (nu,) of
         # each input, where b is the generalised force per unit of the input.
-        self._mobility = np.sqrt(np.linalg.inv(M).diagonal())
+        self.mobility = np.sqrt(np.linalg.inv(M).diagonal())
         lower = B[-self._nv :]
         inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
-        self._input_mobility = np.where(inputs > 0.0, inputs, 1.0)
+        self.input_mobility = np.where(inputs > 0.0, inputs, 1.0)
+        self._terms, self.push = self._sizes(self._v)
 
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
@@ -369,12 +391,12 @@ class Scales:
         # joint. Columns of B are divided by the mobility of their input. If large terms cancel in a
         # block of A, errors are relative to these terms, because their rounding errors remain.
         state, lin, nv = self._state, self._lin, self._nv
-        terms = self._cancelling_terms(self._v)
+        terms = self._terms
         if steps is not None:
-            there = self._cancelling_terms(np.abs(self._v) + state.spread(steps[-nv:]))
+            there, _ = self._sizes(np.abs(self._v) + state.spread(steps[-nv:]))
             terms = np.maximum(terms, rounding * there)
-        row_scale = np.concatenate((np.ones(nv), self._mobility))[:, None]
-        column_scale = np.where(np.arange(2 * nv)[:, None] < nv, 1.0, self._input_mobility)
+        row_scale = np.concatenate((np.ones(nv), self.mobility))[:, None]
+        column_scale = np.where(np.arange(2 * nv)[:, None] < nv, 1.0, self.input_mobility)
         of_A, of_B = (lin.A - A) / row_scale, (lin.B - B) / row_scale / column_scale
         own, groups, errors = lin.A / row_scale, state.groups._asdict(), dict[str, float]()
         for i, (row, rows) in enumerate(groups.items()):
@@ -385,12 +407,19 @@ class Scales:
                 errors[f"B[{row}, {column}]"] = _largest(of_B[rows, inputs])
         return errors
 
-    def _cancelling_terms(self, v: Array) -> Array:
-        """Return the size (6, 6) of the terms that may cancel in each block of the scaled A."""
+    def _sizes(self, v: Array) -> tuple[Array, float]:
+        """Return the sizes (6, 6) of cancelling terms in each block of the scaled A, and in f0."""
         # The base's linear velocity is reduced by _ROUNDING_FRACTION, because it causes only
         # rounding errors in Pinocchio's derivatives.
-        mobility, lin = self._mobility, self._lin
-        speed, rate, momentum = self._speeds(v)
+        mobility, lin, robot = self.mobility, self._lin, self._state.robot
+        speed, momentum = np.abs(self._state.velocities(v)), 0.0
+        for i, name in enumerate(robot.joint_names, 6):
+            if name in robot.wheels:  # a wheel counts by its momentum, not by its speed
+                momentum += robot.wheels[name] * float(speed[i])
+                speed[i] = 0.0
+        for _, stored in robot.stored_momentum:
+            momentum += float(np.linalg.norm(stored))
+        rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
         # Gyroscopic torque of the wheels per unit rate of their link, in the units of the scaled
         # rows.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
@@ -398,56 +427,108 @@ class Scales:
         slowed[LINEAR] *= _ROUNDING_FRACTION
         resting, unit = slowed / mobility, 1.0 / mobility
         accelerations = _largest(lin.f0[-self._nv :] / mobility)
-        forces = _largest(lin.u0 * self._input_mobility)
+        forces = _largest(lin.u0 * self.input_mobility)
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
         # Derivatives of the velocity-dependent accelerations over the velocities, at the present
         # rates. For angular velocities, they also contain the present linear velocity of the base.
-        turning = rate * np.array([_largest(x) for x in np.split(unit, (3, 6))])
+        turning = rate * np.array([*map(_largest, np.split(unit, (3, 6)))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
         terms[:, 0] *= _largest(self._state.chart(lin.q).J)
-        return terms
+        return terms, forces + rate**2 * _largest(unit) + rate * momentum * _largest(mobility)
 
-    def _speeds(self, v: Array) -> tuple[Array, float, float]:
-        """Return speeds (6 + n,), 0 for wheels; the largest rate; and the wheels' momentum."""
-        speed, robot = np.abs(self._state.velocities(v)), self._state.robot
-        momentum = 0.0
-        for i, name in enumerate(robot.joint_names, 6):
-            if name in robot.wheels:
-                momentum += robot.wheels[name] * float(speed[i])
-                speed[i] = 0.0
-        for _, stored in robot.stored_momentum:
-            momentum += float(np.linalg.norm(stored))
-        return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
-    def rate_errors(self, f0: Array) -> dict[str, float]:
-        """Compare the model with another f0, relative to the largest terms that f0 sums."""
-        mobility, (_, rate, momentum) = self._mobility, self._speeds(self._v)
-        push = _largest(self._lin.u0 * self._input_mobility)
-        push += rate**2 * _largest(1.0 / mobility) + rate * momentum * _largest(mobility)
-        sizes, errors = np.concatenate((np.ones(self._nv), mobility * push)), dict[str, float]()
-        for name, part in self._state.groups._asdict().items():
-            size = max(_largest(sizes[part]) or 1.0, _largest(f0[part]))
-            errors[f"f0[{name}]"] = _largest(self._lin.f0[part] - f0[part]) / size
-        return errors
+class Nonlinear:
+    """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, computed by ABA.
 
-    def difference_steps(self) -> Array:
-        """Return the steps (nx + nu,) of finite differences over x and u at the model's point."""
-        state, lin, nv = self._state, self._lin, self._nv
-        # The accelerations of light, aligned links change over small rotations. The step is smaller
-        # than these rotations.
-        step = np.full(2 * nv, 2e-4)
-        # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
-        step[state.groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[state.groups.q_b]))
-        # f is quadratic in the velocities and linear in the inputs, so these steps can be large
-        # without a truncation error.
-        speed = np.abs(lin.x0[-nv:])
-        step[-nv:] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
-        step[state.groups.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
-        push = max(1.0, _largest(lin.f0[-nv:] / self._mobility)) / self._input_mobility
-        return np.concatenate((step, push))
+    If the linear model has a moving reference, x is the error relative to this reference. Then f is
+    0 at the operating point.
+    """
+
+    def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
+        self._aba, self._lin = aba, lin
+        self.state = state or aba.state
+        observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
+        moves = np.linalg.norm(observer) > _FAST and aba.field is None
+        self._observer = observer if moves else np.zeros(3)
+        # Velocity and acceleration of the reference.
+        self._v: Array = np.zeros((1, aba.state.robot.nv))
+        self._a: Array = np.zeros_like(self._v)
+        if lin.moving:
+            _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
+
+    def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
+        """Return the charts, q, v and dv/dt (Pinocchio's order) for rows (x, u) (N, nx + nu)."""
+        x, u = np.split(point, [self.state.nx], axis=1)
+        chart, q, v = self.state.points(x)
+        observer = self._observer @ rotation_matrices(q[:, 3:7])
+        relative = v.copy()
+        relative[:, PIN_LINEAR] -= observer
+        a = self._aba.accelerations(q, relative, self._aba.actuation.in_base_axes(chart, u))
+        a[:, PIN_LINEAR] -= np.cross(v[:, PIN_ANGULAR], observer)
+        return chart, q, v, a
+
+    def rates(self, point: Array) -> Array:
+        """Return dx/dt (N, nx) for rows (x, u) (N, nx + nu)."""
+        state, (chart, _, v, a) = self.state, self.accelerations(point)
+        # Rates of the error relative to a reference with velocities v* and w*: edot = (e0 (w - w*)
+        # + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
+        at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
+        turning = chart.q0 * (angular - at_angular)
+        turning += np.cross(chart.q_b, angular + at_angular)
+        position_rate = coordinates.times(chart.R, linear) - at_linear
+        position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
+        rate = state.velocities(a)
+        if state.axes[1]:
+            # Components of v in reference axes have another derivative than components in base
+            # axes. Add the difference w x v.
+            rate[:, LINEAR] += np.cross(angular, linear)
+        rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
+        joint_rates = state.velocities(v - self._v)[:, 6:]
+        return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
+
+    def flow_error(self) -> float:
+        """Return the relative error of f, compared with finite differences along short motions."""
+        lin, robot = self._lin, self.state.robot
+        reference = pin.SE3(lin.reference.rotation, np.zeros(3))
+        state = StateMap(robot, reference=reference, frame=lin.frame)
+        near = Nonlinear(self._aba, lin, state)
+        # The first row is the point itself. In each other row, one base velocity is increased by 1.
+        x = np.tile(lin.x0, (7, 1))
+        x[:, state.groups.r_b] = 0.0
+        x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
+        point = np.hstack((x, np.tile(lin.u0, (7, 1))))
+        (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
+        # Differences at t = -3 h ... 3 h.
+        h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
+        t, speeds = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None], np.tile(v, (6, 1))
+        moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
+        after = coordinates.state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
+        if lin.moving:  # the first row is also the motion of the reference
+            after = coordinates.moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
+        ahead, behind = after.reshape(2, 3, *x.shape)
+        rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
+        floor, size = 1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1)
+        return float((np.abs(expected - rates).max(axis=1) / np.maximum(floor, size)).max())
+
+
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
+    """Compute the Jacobian of f by central differences; f maps rows of points to rows of values.
+
+    Columns in the mask `is_curved` use sixth-order differences. All others use second-order
+    differences.
+    """
+    curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
+    offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))
+    first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
+    *near, rest = np.split(first - last, len(curved) * np.arange(1, 4))
+    derivatives: Array = np.empty((rest.shape[1], len(point)))
+    derivatives[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
+    derivatives[:, ~is_curved] = 0.5 * rest.T
+    return derivatives / steps
 
 
 def _largest(x: Array) -> float:

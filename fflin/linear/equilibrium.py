@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
-from fflin.base.tables import grid
-from fflin.base.validation import Array, Complex, FrozenArrays, Indices, Mask, instance
+from fflin.base.tables import grid, signals
+from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance
 from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
-
 
 # Rounding error of M a, of accelerations and of principal moments of inertia. It is relative to the
 # terms that are summed.
@@ -70,8 +66,6 @@ class Equilibrium(FrozenArrays):
     force_units: tuple[str, ...]
 
     def __str__(self) -> str:
-        from fflin.base.tables import signals
-
         said = "u: all zero"
         if self.u.any():
             said = signals("u", self.u, self.input_names, self.input_units)
@@ -177,8 +171,17 @@ def equilibrium(
         loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
             break
-        step = state.spread(balance.newton_step(linearizer, soft))
-        at = pin.integrate(robot.model, balance.lin.q, step)
+        lin, step = linearizer(balance.lin.q, v, balance.u), np.zeros(len(soft))
+        hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
+        own = np.sqrt(robot.springs.stiffness[soft[6:]])
+        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
+            weak = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
+            raise EquilibriumError(
+                f"the springs of {weak} are too weak to hold '{robot.name}' at this "
+                "configuration; make them stiffer, or choose another point"
+            )
+        step[soft] = np.linalg.solve(hold, balance.residual[soft])
+        at = pin.integrate(robot.model, lin.q, state.spread(step))
         at[:7] = given[:7]
         balance = _Balance(linearizer, at, v)
         tolerance = np.maximum(tolerance, balance.tolerance)
@@ -231,21 +234,6 @@ class _Balance:
         self.allowed = TOLERANCE * float(np.linalg.norm(target))
         self.allowed += float(np.linalg.norm(mobility * rounding))
         self.residual, self.tolerance = self.left / mobility, rounding + terms
-
-    def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
-        """Return the Newton step (6 + n,) that moves only the coordinates in the mask `soft`."""
-        robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
-        hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
-        own = np.sqrt(robot.springs.stiffness[soft[6:]])
-        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
-            names = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
-            raise EquilibriumError(
-                f"the springs of {names} are too weak to hold '{robot.name}' at this "
-                "configuration; make them stiffer, or choose another point"
-            )
-        step: Array = np.zeros(len(soft))
-        step[soft] = np.linalg.solve(hold, self.residual[soft])
-        return step
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
@@ -445,6 +433,7 @@ def relative_equilibria(
             "axis"
         )
     n, found, field = mean_motion(robot), [], OrbitField(robot, frame_of(robot, frame))
+    rounding = _ROUNDING * (sizes[2] / sizes[0]) ** 2
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs
         if np.linalg.det(own) < 0.0:
@@ -452,23 +441,17 @@ def relative_equilibria(
         R = field.axes @ own.T
         at, moments = q.copy(), sizes[list(order)]
         at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
-        poles, margin = _libration(moments, n)
+        radial, along, normal = moments.tolist()
+        pitch = 3.0 * (along - radial) / normal
+        k_a, k_r = (normal - radial) / along, (normal - along) / radial
+        b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
+        # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
+        apart = np.sqrt(complex(b * b - 4.0 * c))
+        larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
+        squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
+        roots = n * np.sqrt(squares)
+        poles = np.column_stack((roots, -roots)).ravel()
+        margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
         found.append(RelativeEquilibrium(at, moments, poles, stable, margin))
     return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
-
-
-def _libration(moments: Array, n: float) -> tuple[Complex, float]:
-    """Return the poles (6,) of the attitude motion, and its stability margin in rounding errors."""
-    radial, along, normal = moments.tolist()
-    pitch = 3.0 * (along - radial) / normal
-    k_a, k_r = (normal - radial) / along, (normal - along) / radial
-    b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
-    # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
-    root = np.sqrt(complex(b * b - 4.0 * c))
-    larger = -0.5 * (b + (root if b >= 0.0 else -root))
-    squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
-    roots = n * np.sqrt(squares)
-    poles = np.column_stack((roots, -roots)).ravel()
-    rounding = _ROUNDING * (max(moments) / min(moments)) ** 2
-    return poles, float(min(pitch, c, b, b * b - 4.0 * c) / rounding)

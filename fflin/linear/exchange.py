@@ -144,7 +144,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
-    for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
+    inputs = {kind.actuation.names[i]: kind.actuation.units[i] for i in kind.inputs}
+    for signal, units in (("state", states), ("input", inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
     T_u, about = np.linalg.solve(to.V, own.V), "moving" if lin.moving else "fixed"
     fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}

@@ -137,8 +137,8 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
         return fields | {
             "moving": bool(fields["moving"]),
             "verified": verified,
-            "_reference": fields.pop("reference"),
-            "_drift": drift if drift.size else None,
+            "placement": fields.pop("reference"),
+            "drift": drift if drift.size else None,
             "_inertia": partial(given, fields.pop("M")),
             "_ignorable": partial(given, fields.pop("ignorable")),
             "_limits": partial(dict, dict(zip(limit_names, limits, strict=True))),

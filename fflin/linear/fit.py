@@ -24,8 +24,21 @@ Names: TypeAlias = tuple[str, ...]
 Signals: TypeAlias = tuple[Names, Names]
 
 
-def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False) -> None:
-    """Raise `InputError` if a model's states or inputs differ from the robot's.
+def about_point(lin: object) -> LinearModel:
+    """Return a linear model about a point; raise `InputError` for a moving reference."""
+    model = instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    if model.moving:
+        raise InputError(
+            "the model has a moving reference, expected a fixed one; linearise with moving=False, "
+            "or follow the moving reference with TrajectoryFeedback"
+        )
+    return model
+
+
+def require_fit(
+    lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False, sensed: bool = False
+) -> None:
+    """Raise `InputError` if a model's states or inputs, or outputs (`sensed`), are not the robot's.
 
     A reduced model, which lacks states of the robot, is accepted unless `whole` is True.
     """
@@ -33,12 +46,8 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool 
     require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)
     require_same(made, state, "input", lin.input_names, lin.input_units)
     require_turns(made, len(lin.q), robot)
-
-
-def require_sensed(lin: LinearModel, state: StateMap) -> None:
-    """Raise `InputError` if a model's outputs differ from the robot's."""
-    made = f"the model was made for '{lin.robot}'"
-    require_same(made, state, "output", lin.output_names, lin.output_units)
+    if sensed:
+        require_same(made, state, "output", lin.output_names, lin.output_units)
 
 
 def signals_of(state: StateMap, kind: str) -> Signals:
@@ -134,13 +143,8 @@ def outputs(
     array([0. , 0.4, 0. ])
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:
-        raise InputError(
-            "the model has a moving reference, expected a fixed one; linearise with moving=False"
-        )
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    require_fit(lin, robot, state)
-    require_sensed(lin, state)
+    state = StateMap(robot, reference=about_point(lin).reference, frame=lin.frame)
+    require_fit(lin, robot, state, sensed=True)
     at = robot.checked_configuration(q)
     moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")

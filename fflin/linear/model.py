@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
+from fflin.base.writing import as_path
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
     import control
-    import pinocchio as pin
     from scipy import signal
 
     from fflin import ToolModel
@@ -117,6 +118,12 @@ class LinearModel(StateSpace):
     moving : bool
         Whether the state is the error relative to a reference that moves through the operating
         point.
+    placement : ndarray (7,)
+        The placement `reference`: position [m] and quaternion x, y, z, w.
+    drift : ndarray (nx,) or None
+        State derivative of a moving reference, or None if the reference is fixed. The attitude rate
+        excludes rotation about the direction of gravity, because this rotation does not affect the
+        dynamics. If the reference moves, f0 is zero.
     q : ndarray (nq,)
         Configuration at the operating point in Pinocchio's order.
     v : ndarray (nv,)
@@ -158,11 +165,11 @@ class LinearModel(StateSpace):
     locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
-    _reference: Array = field()
+    placement: Array
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
-    _drift: Array | None = None
+    drift: Array | None = None
     # For a model that was made from another model: its fingerprint, and the other model. The other
     # model has the certificate. Its matrices also have exact zeros, which are lost by the matrix
     # exponential of a discretisation.
@@ -193,23 +200,7 @@ class LinearModel(StateSpace):
     @property
     def reference(self) -> pin.SE3:
         """Placement oMref relative to which the attitude and position of the base are measured."""
-        import pinocchio as pin
-
         return pin.XYZQUATToSE3(self.placement)
-
-    @property
-    def placement(self) -> Array:
-        """The placement `reference` as an array (7,): position [m] and quaternion x, y, z, w."""
-        return self._reference
-
-    @property
-    def drift(self) -> Array | None:
-        """State derivative (nx,) of a moving reference, or None if the reference is fixed.
-
-        The attitude rate excludes rotation about the direction of gravity, because this rotation
-        does not affect the dynamics. If the reference moves, f0 is zero.
-        """
-        return self._drift
 
     @cached_property
     def M(self) -> Array:
@@ -402,7 +393,6 @@ class LinearModel(StateSpace):
         InputError
             If a value is not finite.
         """
-        from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
 
         write_model(as_path(path), record_of(self), checksummed=self.verified)
@@ -416,7 +406,6 @@ class LinearModel(StateSpace):
         FileError
             If the file cannot be read, is damaged or does not contain a linear model.
         """
-        from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model
 
         values, certificate = read_model(as_path(path), Certificate)

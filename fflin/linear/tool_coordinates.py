@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-import fflin.base.rotation as turning
 from fflin.base.errors import ChartError, InputError, unknown
-from fflin.base.rotation import quaternion_product, skew
+from fflin.base.rotation import product_matrix, quaternion_product, rotation_matrix, skew
 from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, placement, vector
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
@@ -91,13 +90,12 @@ class ToolCoordinates:
                 "the robot a BaseTorque too"
             )
         # For each input of the tool, the index of the robot's input.
-        self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
+        self.inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
-            self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
+            self.inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
-            self._inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
-        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
+            self.inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
@@ -157,7 +155,7 @@ class ToolCoordinates:
             raise InputError(
                 f"the quaternion w, x, y, z has length {length:.9g}, expected 1; normalise it"
             )
-        return turning.rotation_matrix(np.roll(attitude, -1) / length)
+        return rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude in x' as a quaternion x, y, z, w and as a rotation matrix."""
@@ -166,7 +164,7 @@ class ToolCoordinates:
         if self.convention.attitude == "q_b":
             quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
             quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
-        return quaternion, turning.rotation_matrix(quaternion)
+        return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
         """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes."""
@@ -191,9 +189,9 @@ class ToolCoordinates:
         # errors and tangent vectors are constant, so their step is zero.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
-        turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
+        turns = 0.5 * product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
         quaternion = here + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
-        R, w, vec = turning.rotation_matrix(quaternion), quaternion[3], quaternion[:3]
+        R, w, vec = rotation_matrix(quaternion), quaternion[3], quaternion[:3]
         by_turn = -self._rotated(R) @ self._held(twist)
         attitude: Any = np.eye(3) + 0.5 * skew(moved[ANGULAR])
         if kind.attitude == "euler":
@@ -227,7 +225,7 @@ class ToolCoordinates:
         V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
         held = self._held(np.linalg.solve(X.T, wrench @ u))
         H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
-        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self.inputs], H, extra)
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:

@@ -20,7 +20,7 @@ from fflin.base.validation import Array, ArrayLike, instance, number, truth, vec
 from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
-from fflin.control.tracking import followed, largest_rate, reference_of, tracking_of
+from fflin.control.tracking import followed, largest_rate, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
@@ -114,7 +114,8 @@ class Plan:
         self.plant = plant = Plant(state, options.disturbance)
         self.policy: object = policy
         self.method = integrator(options.method)
-        follows, (lin, _) = reference_of(policy), feedback_of(policy)
+        along, (lin, _) = tracking_of(policy), feedback_of(policy)
+        follows = along.reference if along else None
         default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
         # Initial configuration (nq,) and velocity (nv,).
         self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)
@@ -356,7 +357,7 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
     assert closed is not None
-    loop, dt, _ = closed
+    loop, dt = closed
     step = dt or _LOOK
     if not dt:
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]

@@ -121,17 +121,6 @@ class LFT(Design):
         """Sampling time, which is 0 because the model is in continuous time."""
         return 0.0
 
-    def deltas(self, values: Mapping[str, float]) -> Array:
-        """Return the deltas (k,) for parameter values {parameter or pattern: value}.
-
-        The delta of every other parameter is 0.
-        """
-        found = np.zeros(len(self.parameters))
-        for key, value in numbers("values", values, "parameter", "value").items():
-            for at in matching("parameter", key, self.parameters):
-                found[at] = (value - self.middle[at]) / self.half[at]
-        return found
-
     def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
         r"""Return A, B, C and D at given values of the parameters.
 
@@ -154,7 +143,11 @@ class LFT(Design):
             values.
         """
         if isinstance(values, Mapping):
-            values = self.deltas(values)
+            given = numbers("values", values, "parameter", "value")
+            values = np.zeros(len(self.parameters))
+            for key, value in given.items():
+                for at in matching("parameter", key, self.parameters):
+                    values[at] = (value - self.middle[at]) / self.half[at]
         rows = as_double("values", values)
         if not np.isfinite(rows).all() or rows.shape[-1:] != self.repeats.shape:
             raise InputError(
@@ -162,16 +155,14 @@ class LFT(Design):
             )
         delta = np.repeat(rows, self.repeats.astype(int), axis=-1)
         within = np.eye(len(self.D11)) - self.D11 * delta[..., None, :]
-        given = np.concatenate((self.C1, self.D12), axis=1)
+        outer = np.concatenate((self.C1, self.D12), axis=1)
         try:
-            by = delta[..., None] * np.linalg.solve(
-                within, np.broadcast_to(given, (*delta.shape, given.shape[1]))
-            )
+            z = np.linalg.solve(within, np.broadcast_to(outer, (*delta.shape, outer.shape[1])))
         except np.linalg.LinAlgError:
             raise InputError(
                 "the inertia M is singular at these parameters; give narrower ranges"
             ) from None
-        nx = len(self.A)
+        nx, by = len(self.A), delta[..., None] * z
         return (
             self.A + self.B1 @ by[..., :nx],
             self.B2 + self.B1 @ by[..., nx:],

@@ -7,8 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
-from fflin.base.validation import by_name as mapping
+from fflin.base.validation import Array, by_name, instance, number, numbers, untied, vector, whole
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
@@ -115,11 +114,8 @@ class Uncertain:
                 found |= dict.fromkeys(known.find(key), value)
         return known.robot(found)
 
-    def makes(self, delta: Array) -> bool:
-        """Return whether the robot with the deltas (k,) is physically realisable."""
-        return not self._refusal(delta)
-
-    def _refusal(self, delta: Array) -> str:
+    def refusal(self, delta: Array) -> str:
+        """Return why the robot with deltas (k,) is not physically realisable, or an empty text."""
         values = dict[str, float]()
         for block, d in zip(self.blocks, delta, strict=True):
             values |= block.values(block.middle + block.half * d)
@@ -134,7 +130,7 @@ class Uncertain:
         found, lost = list[Array](), 0
         while len(found) < count:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
-            if not (why := self._refusal(delta)):
+            if not (why := self.refusal(delta)):
                 found.append(delta)
             elif (lost := lost + 1) >= _TRIES * (len(found) + 1):
                 raise InputError(
@@ -259,7 +255,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     given: dict[str, object] = {}
-    for key, value in mapping("ranges", ranges, "parameter").items():
+    for key, value in by_name("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
             given |= {f"{key}.{part}": each for part, each in value.items()}
         else:
@@ -289,7 +285,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
             raise InputError(
                 f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
             )
-    if why := made._refusal(np.zeros(len(made.blocks))):
+    if why := made.refusal(np.zeros(len(made.blocks))):
         raise InputError(
             f"the robot at the middle of the ranges is not valid: {why}; give other ranges"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
-from itertools import islice, pairwise, product
+from itertools import filterfalse, islice, pairwise, product
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -125,7 +125,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
         corners = np.array(list(product((-1.0, 1.0), repeat=size)))
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
-    physical = np.array([of.makes(corner) for corner in corners])
+    physical = np.array([not of.refusal(corner) for corner in corners])
     # Draws come last, so that a search with more draws first repeats the search with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
@@ -136,7 +136,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     found, bar = [], Progress()
     undamped = Figures(loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b)
     for figures in (undamped, loops.figures(disk), loops.figures(whole)):
-        value, delta = _largest(figures, tried, of.makes)
+        value, delta = _largest(figures, tried, of.refusal)
         found.append(Found(value, of.values(delta)))
         bar(len(found), 4)
     unstable = loops.undamped(tried) >= 0.0
@@ -218,22 +218,22 @@ class Loops:
         return Figures(quick, exact, above)
 
 
-def _largest(figures: Figures, tried: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
+def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
     """Return the largest criterion found by local searches, and its deltas.
 
     A search starts at the first sample, and at each sample whose criterion exceeds the result so
     far. So no sample exceeds the result, and further samples cannot decrease the result.
     """
-    best, at = _climbed(figures, tried[0], makes)
+    best, at = _climbed(figures, tried[0], refuse)
     ahead = tried[1:]
     while np.isfinite(best) and len(ahead := ahead[figures.above(ahead, best)]):
         if figures.exact(ahead[:1])[0] > best:
-            best, at = _climbed(figures, ahead[0], makes)
+            best, at = _climbed(figures, ahead[0], refuse)
         ahead = ahead[1:]
     return best, at
 
 
-def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> tuple[float, Array]:
+def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
     """Maximise a criterion locally; a step follows the gradient, or moves one delta to an end."""
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
@@ -246,7 +246,7 @@ def _climbed(figures: Figures, start: Array, makes: Callable[[Array], bool]) -> 
         alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
         trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
         before = value
-        for trial in islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD):
+        for trial in islice(filterfalse(refuse, trials[np.argsort(-quick(trials))]), _HELD):
             if (reached := float(exact(trial[None])[0])) > value:
                 value, delta = reached, trial
         if not value > before + 1e-9 * abs(before):

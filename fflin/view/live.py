@@ -61,11 +61,9 @@ class Live:
         self._lock = threading.Lock()
         # Clock time and simulation time [s] at the first shown step of a simulation.
         self._began: tuple[float, float] | None = None
-        self._running, self._state, self._clients = False, "{}", set[_Socket]()
+        self._state, self._clients = "{}", set[_Socket]()
         self._page, page.window.forward = page, partial(self._each, _Socket.send)
         self.meshcat, self.notes = page.meshcat, tuple(page.notes)
-        poses = body_poses(robot, q)
-        page.set_stage(poses)
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         sliders = [
             {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
@@ -73,7 +71,7 @@ class Live:
         ]
         self._html = page.html(
             "live",
-            page.drawing.points(poses),
+            page.points,
             follow=bool(follow),
             joints=sliders,
             names=[*axes, *robot.joint_names],
@@ -107,10 +105,8 @@ class Live:
             self._stop = asyncio.Event()
             server = HTTPServer(application)
             server.add_socket(listener)
-            self._running = True
             started.set()
             await self._stop.wait()
-            self._running = False
             server.stop()
             for client in list(self._clients):
                 client.close()
@@ -178,9 +174,8 @@ class Live:
         self._call(lambda: [what(client, *arguments) for client in list(self._clients)])
 
     def _call(self, what: Callable[[], object]) -> None:
-        if self._running:
-            with contextlib.suppress(RuntimeError):  # the server was just closed
-                self._loop.call_soon_threadsafe(what)
+        with contextlib.suppress(RuntimeError):  # the server is closed
+            self._loop.call_soon_threadsafe(what)
 
     def _asked(self, message: Request) -> None:
         q = self.q.copy()

@@ -151,10 +151,11 @@ class Drawing:
                 }
                 self._send("set_object", body[f"{index}_{part}"], object=content)
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        self.bodies = list(corners)  # Pinocchio joints
-        self.corners = [
-            _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
-        ]
+        # {Pinocchio joint: corners (8, 3) of its body's bounding box}
+        self.corners = {
+            joint: _box_corners(np.eye(4), _bounds(np.concatenate(boxes)))
+            for joint, boxes in corners.items()
+        }
 
     def place(self, poses: Array) -> None:
         """Set the poses (njoints - 1, 7) of all bodies: position, then quaternion x, y, z, w."""
@@ -165,7 +166,7 @@ class Drawing:
     def points(self, poses: Array) -> Array:
         """Return the corners (M, 3) of all bounding boxes in the world."""
         found = []
-        for joint, corners in zip(self.bodies, self.corners, strict=True):
+        for joint, corners in self.corners.items():
             placement = pin.XYZQUATToSE3(poses[joint - ROOT])
             found += [placement.act(corner) for corner in corners]
         return np.array(found)
@@ -317,9 +318,14 @@ def subtitle(robot: Robot) -> str:
 
 
 class Page:
-    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read."""
+    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read.
 
-    def __init__(self, robot: Robot, scene: str, tool: str | None, frame: str | None) -> None:
+    The first frame shows the configuration `q` (nq,).
+    """
+
+    def __init__(
+        self, robot: Robot, q: Array, scene: str, tool: str | None, frame: str | None
+    ) -> None:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
         self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
         self.meshcat = Visualizer(window=self.window)
@@ -337,15 +343,11 @@ class Page:
                 nozzle["position"] = placement.act(np.array(item.position)).tolist()
                 nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
                 self.nozzles.append(nozzle)
-        self.floor, self.centre = np.zeros(3), np.zeros(3)  # [m] `floor` is below the robot
-        self.size = 1.0  # [m] radius of the robot in the first frame
-
-    def set_stage(self, poses: Array) -> None:
-        """Set the floor, centre and size from the poses (njoints - 1, 7) in the first frame."""
-        points = self.drawing.points(poses)
-        low, high = points.min(axis=0), points.max(axis=0)
+        # [m] Corners, centre and radius of the robot in the first frame, and the floor below it.
+        self.points = self.drawing.points(body_poses(robot, q))
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
         self.centre = (low + high) / 2.0
-        self.size = max(float(np.linalg.norm(points - self.centre, axis=1).max()), 1e-3)
+        self.size = max(float(np.linalg.norm(self.points - self.centre, axis=1).max()), 1e-3)
         self.floor = np.array([*self.centre[:2], low[2]])
 
     def html(self, mode: str, points: Array, **entries: object) -> str:

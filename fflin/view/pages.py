@@ -6,8 +6,8 @@ The page of natural modes animates one mode of a robot at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple, cast
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, Frame, StateMap
@@ -61,7 +62,7 @@ def motion_page(
 ) -> str:
     """Return the page of a motion; see `visualize`."""
     robot, shown = page.robot, frame_indices(motion.t, fps, speed)
-    frame = cast("Frame", motion.frame)
+    frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
     if target is None:  # none, one, or one for each frame
@@ -99,7 +100,6 @@ def motion_page(
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
-    page.set_stage(film.poses[0])
     corners = [frame_points(page, film)]
     for each, rows in ((page.drawing, goals), *held):
         corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
@@ -128,10 +128,9 @@ def motion_page(
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: corners of the bodies, tips of the forces."""
-    chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
-    for index in chosen:
+    for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
         base = film.poses[index, 0, :3]
         tip = base + ARROW * page.size * film.force[index] / strongest
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
@@ -186,10 +185,7 @@ def frame_indices(t: Array, fps: float, speed: float) -> Array:
     duration = float(t[-1] - t[0])
     count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
     wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
-    after = np.clip(np.searchsorted(t, wanted), 1, len(t) - 1) if len(t) > 1 else np.zeros(1, int)
-    if len(t) > 1:
-        after -= wanted - t[after - 1] < t[after] - wanted
-    return np.unique(after)
+    return np.unique(np.searchsorted((t[1:] + t[:-1]) / 2.0, wanted))
 
 
 def play_back(state: StateMap, q: Array, u: Array) -> Playback:
@@ -339,9 +335,11 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
     }
 
 
-def mode_page(page: Page, found: Modes) -> str:
-    """Return the page of a robot's modes."""
-    robot, lin = page.robot, found.lin
+def mode_page(
+    robot: Robot, found: Modes, scene: str, tool: str | None
+) -> tuple[str, Collection[str]]:
+    """Return the page of a robot's modes, and notes about parts that are not drawn."""
+    lin = found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
         raise InputError(
@@ -354,11 +352,10 @@ def mode_page(page: Page, found: Modes) -> str:
             f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
             "joints a stiffness"
         )
-    at_rest = body_poses(robot, lin.q)
+    page, at_rest = Page(robot, lin.q, scene, tool, lin.frame), body_poses(robot, lin.q)
     page.drawing.place(at_rest)
     Drawing(page, robot, "rest", "ghost").place(at_rest)
-    page.set_stage(at_rest)
-    swings = [_swing(state, page.drawing, mode, lin, page.size) for mode in found.vibrations]
+    swings = [_swing(state, page, mode, lin) for mode in found.vibrations]
     points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
     modes = [
         {
@@ -373,10 +370,11 @@ def mode_page(page: Page, found: Modes) -> str:
     ]
     about = f"{subtitle(robot)}, {counted(len(modes), 'vibration')}"
     corners = np.concatenate(points)
-    return page.html("modes", corners, subtitle=about, period=_PERIOD, modes=modes)
+    html = page.html("modes", corners, subtitle=about, period=_PERIOD, modes=modes)
+    return html, page.notes
 
 
-def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
+def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
     """Return the poses (_PHASES, njoints - 1, 7) of a mode's oscillation over one period."""
     robot, half = state.robot, len(lin.x0) // 2
 
@@ -388,14 +386,13 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
 
     # Largest displacement of a corner per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    rest = drawing.points(body_poses(robot, lin.q))
-    moved = np.array([drawing.points(each) - rest for each in poses(small)])
+    moved = np.array([page.drawing.points(each) - page.points for each in poses(small)])
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [
         {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]
     ]
     most = [_ANGLE / turned.max()] if turned.any() else []
-    most += [_SHARE * size / reach] if reach else []
+    most += [_SHARE * page.size / reach] if reach else []
     return poses(min(most, default=0.0))
 
 

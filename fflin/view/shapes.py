@@ -175,10 +175,9 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
-        size = tuple(sides.tolist())
         placement = pin.SE3(axes, inertia.lever)
         link = "base" if joint == ROOT else robot.model.names[joint]
-        yield Shape(joint, "box", size, placement, finish="inertia", link=link)
+        yield Shape(joint, "box", tuple(sides.tolist()), placement, finish="inertia", link=link)
 
 
 class Bending(NamedTuple):
@@ -306,7 +305,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
     if not corners.size or not np.isfinite(corners).all():
         raise ValueError(f"{path}: has no triangles")
-    extent = float(np.ptp(corners, axis=0).max())
+    extent = float(np.ptp(corners, axis=0).max()) or 1.0  # 0 if all corners coincide
     resolution = _RESOLUTION
     while True:
         welded = [
@@ -356,8 +355,6 @@ def _triangles(path: Path) -> tuple[Array, Indices]:
 
 def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
     """Merge all vertices in the same cell of a grid; drop triangles that collapse."""
-    if not cell:
-        return vertices[:0].astype(np.float32), faces[:0].astype(np.uint32)
     _, first, inverse = np.unique(
         np.round(vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )

@@ -155,6 +155,8 @@ def visualize(
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     opened = None if open is None else truth("open", open)
     tool = tool_frame(robot, tool)
+    from fflin.view.page import Page
+
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
@@ -164,10 +166,9 @@ def visualize(
         port = whole("port", port, 0, 2**16 - 1)
         q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
-        from fflin.view.page import Page
 
         pace = positive("speed", 1.0 if speed is None else speed)
-        page = Page(robot, scene, tool, frame)
+        page = Page(robot, q, scene, tool, frame)
         live = Live(page, q, follow=follow, speed=pace, port=port)
         for note in page.notes:
             warn(note, FflinWarning, stacklevel=2)
@@ -176,7 +177,6 @@ def visualize(
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     from fflin.analysis.modes import Modes
-    from fflin.view.page import Page
     from fflin.view.pages import mode_page, motion_page
 
     contents: dict[Path, bytes] = {}
@@ -185,17 +185,16 @@ def visualize(
             raise InputError(
                 "png or gif is given, but modes can be shown only in an HTML page; give html="
             )
-        page = Page(robot, scene, tool, motion.lin.frame)
-        found = mode_page(page, motion)
+        found, notes = mode_page(robot, motion, scene, tool)
     else:
         robot = _robot_of(robot, motion)
         start, end = float(motion.t[0]), float(motion.t[-1])
         fps, speed, times = check_playback(fps, speed, times, start, end)
         goal = None if target is None else _configuration(robot, "target", target)
-        page = Page(robot, scene, tool, motion.frame)
+        page = Page(robot, motion.q[0], scene, tool, motion.frame)
         found = motion_page(page, motion, fps, speed, follow, goal)
-        contents = _pictures(found, outputs, motion, speed, times)
-    for note in page.notes:
+        contents, notes = _pictures(found, outputs, motion, speed, times), page.notes
+    for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
     write_atomically(contents | ({shown: found.encode()} if shown else {}))
@@ -293,8 +292,6 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 def _pictures(
     page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
 ) -> dict[Path, bytes]:
-    if ".png" not in outputs and ".gif" not in outputs:
-        return {}
     from fflin.view.capture import take_gif, take_png
 
     start, end = float(motion.t[0]), float(motion.t[-1])

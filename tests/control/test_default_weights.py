@@ -12,7 +12,6 @@ import pytest
 import fflin
 from fflin.control.default_weights import BANDWIDTH, _damping
 from fflin.control.gain import cautions
-from fflin.control.weights import rule_weights
 from fflin.dynamics.state import StateMap
 from fflin.robot.catalog import find_robot
 from tests.support.messages import says
@@ -501,29 +500,42 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
     _, lin, gain = loops("ets_vii")
     sizes = {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1, "omega_b": 0.1, "v_b": 0.1, "qdot_m": 0.1}
     efforts = {"tau_b": 100.0, "F_b": 100.0, "tau_m": 20.0}
-    Q, R, _, _ = rule_weights(lin, None, {"bryson": sizes | efforts})
+    found = fflin.lqr(lin, weights={"bryson": sizes | efforts})
+    Q, R = found.Q, found.R
     assert pytest.approx(fflin.bryson(lin, sizes), rel=1e-12) == Q.diagonal()
     assert pytest.approx(fflin.bryson(lin, efforts), rel=1e-12) == R.diagonal()
     assert np.count_nonzero(Q) == len(Q)
     # What the rule displaces the base by leaves the rule's own weight on it, on average.
     own = np.sin(np.radians(15.0))
-    Q, R, _, rule = rule_weights(lin, None, {"bryson": {"q_b": own}})
+    found = fflin.lqr(lin, weights={"bryson": {"q_b": own}})
+    R, rule = found.R, found.weights
     scale = R[0, 0] / gain.R[0, 0]
     assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(own**-2, rel=1e-9)
     assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("for this rule alone)")
     # The tighter one is held, the more of every input it takes.
     norms = []
     for size in (own, 0.1 * own, 0.01 * own):
-        Q, R, _, _ = rule_weights(lin, None, {"bryson": {"q_b": size}})
-        norms.append(np.linalg.norm(fflin.lqr(lin, Q, R).K[:, :3]))
+        found = fflin.lqr(lin, weights={"bryson": {"q_b": size}})
+        norms.append(np.linalg.norm(found.K[:, :3]))
     assert norms[0] < norms[1] < norms[2]
 
 
 def test_a_given_weight_replaces_the_weight_of_the_rule(loops):
     _, lin, gain = loops("ets_vii")
     own = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
-    Q, R, _, _ = rule_weights(lin, None, own)
-    assert Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == R).all()
+    found = fflin.lqr(lin, weights=own)
+    assert found.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == found.R).all()
+    assert found.weights.startswith("q_b.x as given; all other weights: from")
+    # As the robot's own weights, over which given ones take precedence, and which a rule replaces.
+    robot = fflin.load("ets_vii").replace(weights={"q": {"q_b": 7.0}, "r": {"tau_b": 3.0}})
+    model = fflin.linearize(robot)
+    both = fflin.lqr(model, weights=own)
+    assert both.Q[0, 0] == own["q"]["q_b.x"] and both.Q[1, 1] == 7.0 and both.R[0, 0] == 3.0
+    alone = fflin.lqr(model, weights={"rule": "identity"} | own)
+    assert alone.Q.diagonal().tolist() == [own["q"]["q_b.x"], *[1.0] * (len(lin.A) - 1)]
+    for wrong, said in (({"Q": 1.0}, "'Q'"), ({"q": 1.0}, "q "), ({"rule": "none"}, "'none'")):
+        with pytest.raises(fflin.FflinError, match=said):
+            fflin.lqr(lin, weights=wrong)
 
 
 def test_a_gain_says_which_thrusters_it_lets_pull():

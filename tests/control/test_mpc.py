@@ -66,7 +66,7 @@ def exactly(m):
 
 def planned_by(policy, e, t=0.0):
     """All deviations of the inputs that a controller plans."""
-    ahead = Receding(policy.horizon)
+    ahead = Receding(policy.horizon, None)
     first = ahead.step(t, e)
     stages = policy.horizon.window(t)
     z, flag = ahead._solved(ahead._free @ e)
@@ -90,7 +90,7 @@ def test_without_limits_it_is_the_regulator(name, given):
     m = policy.matrices(e)
     first = np.linalg.solve(m.H, -m.g)[: len(lin.u0)]
     assert first == pytest.approx(-gain.K @ e, abs=1e-10 * np.abs(gain.K @ e).max())
-    assert Receding(policy.horizon).step(0.0, e) == pytest.approx(-gain.K @ e, rel=1e-10)
+    assert Receding(policy.horizon, None).step(0.0, e) == pytest.approx(-gain.K @ e, rel=1e-10)
 
 
 @pytest.mark.parametrize("Qf", ["steady", 30.0])
@@ -179,7 +179,7 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
         bounds=[(None, None)] * len(d) + [(0, None)] * len(price),
     )
     assert price @ excess[m.soft] == pytest.approx(least.fun, rel=0.02)
-    ahead = Receding(policy.horizon)
+    ahead = Receding(policy.horizon, None)
     ahead.step(0.0, e)
     assert says(ahead.notes[0], "each of 12 samples of 0.1 s: 1", "qdot_m.joint")
 
@@ -226,11 +226,11 @@ def test_slews_that_break_the_regulator_are_held(servicer):
 def test_where_it_begins_the_search_changes_nothing(servicer):
     _, lin = servicer
     policy = fflin.mpc(lin, *weights(lin), horizon=20, dt=0.25, limits=["urdf", WEAK])
-    e, warm = np.zeros(30), Receding(policy.horizon)
+    e, warm = np.zeros(30), Receding(policy.horizon, None)
     e[:3] = 0.3, -0.24, 0.32
     for k in range(40):
         d = warm.step(0.25 * k, e)
-        assert d == pytest.approx(Receding(policy.horizon).step(0.25 * k, e), abs=1e-6)
+        assert d == pytest.approx(Receding(policy.horizon, None).step(0.25 * k, e), abs=1e-6)
         e = policy.lin.A @ e + policy.lin.B @ d
 
 
@@ -312,7 +312,7 @@ def test_thrusters_do_not_pull_and_motors_may_have_failed():
     e = np.zeros(len(lin.x0))
     e[:6] = 0.1
     thrust = [i for i, unit in enumerate(lin.input_units) if unit == "N"]
-    d = Receding(policy.horizon).step(0.0, e)
+    d = Receding(policy.horizon, None).step(0.0, e)
     assert (d[thrust] >= 0.0).all() and (d[thrust] > 0.0).any()
     wheels = fflin.mpc(lin, 1.0, 1.0, horizon=10, dt=0.5, limits={"thrust": 0.01, "wheel_x": 0.0})
     u = planned_by(wheels, e).reshape(10, -1)

@@ -425,6 +425,20 @@ def test_what_is_no_plan_is_refused(cube, wrong, said):
         fflin.plan(robot, **{"goal": (None, None), "duration": 1.0} | wrong)
 
 
+def test_a_lower_limit_above_the_upper_is_named():
+    """A least torque beyond the effort of the URDF; `simulate` and `mpc` say it too."""
+    robot = fflin.load("servicer_7dof")
+    effort = fflin.linearize(robot).limits["tau_m.joint_1"]
+    inputs = [fflin.BaseTorque(), fflin.JointTorque("joint_1", min=2.0 * effort)]
+    robot, words = robot.replace(inputs=inputs), rf"tau_m\.joint_1 is {2.0 * effort:g}, above"
+    with pytest.raises(fflin.InputError, match=words):
+        fflin.plan(robot, (None, None), 1.0)
+    with pytest.raises(fflin.InputError, match=words):
+        fflin.mpc(fflin.linearize(robot), 1.0, 1.0, dt=0.1)
+    with pytest.raises(fflin.InputError, match=words):
+        fflin.simulate(robot, duration=1.0, limits="urdf")
+
+
 @pytest.fixture(scope="module")
 def free_floating():
     inputs = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]

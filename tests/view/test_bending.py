@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
-from fflin.view.page import Page, body_poses
+from fflin.view.page import body_poses
 from fflin.view.pages import mode_page, panel
 from fflin.view.shapes import shapes
 
@@ -82,9 +82,8 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
 def test_the_page_of_modes_plays_the_arrays():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
     found = fflin.modes(fflin.linearize(robot))
-    page = Page(robot, "space", None, found.lin.frame)
-    html = mode_page(page, found)
-    assert not page.notes
+    html, notes = mode_page(robot, found, "space", None)
+    assert not notes
     packed = re.findall(r'"poses":"([^"]+)"', html)
     assert len(packed) == len(found.vibrations)
     arrays = [robot.model.getJointId(f"{side}_mode_1") - ROOT for side in ("left", "right")]

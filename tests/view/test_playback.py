@@ -82,7 +82,7 @@ def test_plumes_stand_where_thrusters_push(robots):
     robot = robots["servicer_7dof"].replace(inputs=[fflin.JointTorque("joint_1"), thruster])
     rng = np.random.default_rng(1)
     q, _, u = random_point(robots["servicer_7dof"], rng)
-    (nozzle,) = Page(robot, "space", None, None).nozzles
+    (nozzle,) = Page(robot, q, "space", None, None).nozzles
     name, path, position, direction = (nozzle[k] for k in ("name", "path", "position", "direction"))
     assert name == fflin.linearize(robot).input_names[1]
     joint = robot.model.getJointId(path[-1])

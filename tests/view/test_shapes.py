@@ -172,7 +172,8 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     corners = np.array([[0, 0, 0], [0.5, 0, 0], [0, -2, 0], [0, 0, 3.0]])
     theirs = np.array([placement.act(corner) for corner in corners])
 
-    page = Page(fflin.load(path), "space", None, None)
+    robot = fflin.load(path)
+    page = Page(robot, robot.neutral(), "space", None, None)
     pieces = [umsgpack.unpackb(each) for each in page.window.commands()]
     pieces = [each["object"] for each in pieces if each["type"] == "set_object"]
     (piece,) = (each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry")

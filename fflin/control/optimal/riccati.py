@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_continuous_are, solve_discrete_are
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array, Values
@@ -108,8 +109,6 @@ def solve(
     Raise `LinAlgError` if both fail. Newton's method refines the solution (D. L. Kleinman, IEEE
     Trans. Automatic Control 13(1), 1968).
     """
-    from scipy.linalg import solve_continuous_are, solve_discrete_are
-
     equation = Riccati(A, B, Q, R, N, dt)
     found = _half_size(equation)
     if found is not None and found.residual <= _SOUND:
@@ -167,7 +166,7 @@ def _half_size(equation: Riccati) -> Solution | None:
                 break
             modes, cost = loop
             near = None if equation.discrete else modes
-            found = _refined(equation, modes.lyapunov_modal(cost), near, "structured") or found
+            found = _refined(equation, modes.lyapunov(cost), near, "structured") or found
         if found is not None and found.residual <= _SOUND:
             break
     return found
@@ -201,9 +200,9 @@ def _refined(
         if best.residual <= enough:
             break
         if modes is None:
-            F = equation.A - equation.B @ trial.K
-            modes, fresh = ModalMatrix.of(F, equation.discrete), True
-        better = equation.trial(trial.P + modes.lyapunov(trial.defect))
+            poles, V = np.linalg.eig(equation.A - equation.B @ trial.K)
+            modes, fresh = ModalMatrix(V, poles, equation.discrete), True
+        better = equation.trial(trial.P + modes.lyapunov(modes.V.conj().T @ trial.defect @ modes.V))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution, a Newton step may improve P although the residual rises, so it is
         # accepted.
@@ -239,18 +238,8 @@ class ModalMatrix:
         across = poles.conj()[:, None]
         self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
 
-    @classmethod
-    def of(cls, F: Array, discrete: bool) -> ModalMatrix:
-        """Compute the modes of a matrix."""
-        poles, V = np.linalg.eig(F)
-        return cls(V, poles, discrete)
-
-    def lyapunov(self, r: Array) -> Array:
-        """Solve F' D + D F = -r (discrete: F' D F - D = -r) for a symmetric r (n, n)."""
-        return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
-
-    def lyapunov_modal(self, r: Values) -> Array:
-        """Solve the equation of `lyapunov`, with r given as V^H r V."""
+    def lyapunov(self, r: Values) -> Array:
+        """Solve F' D + D F = -s (discrete: F' D F - D = -s) for a symmetric s, from r = V^H s V."""
         # In modal coordinates, the factors solve the equation element by element.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)

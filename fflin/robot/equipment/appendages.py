@@ -215,9 +215,8 @@ class FlexibleAppendage(FrozenArrays):
 
         squares = self.participation.T**2
         rows = [["mode", "f [Hz]", "damping", "m_x", "m_y", "m_z", "I_x", "I_y", "I_z"]]
-        for mode, f, ratio, sizes in zip(
-            self.modes, self.frequency, self.damping, squares, strict=True
-        ):
+        modes = zip(self.modes, self.frequency, self.damping, squares, strict=True)
+        for mode, f, ratio, sizes in modes:
             rows.append([mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)])
         sums, head = squares.sum(axis=0), f"{self.title}: clamped at frame '{self.frame}'"
         totals = {"all modes": sums}
@@ -383,16 +382,9 @@ class Slosh:
         omega = math.sqrt(acceleration * k * math.tanh(k * height))
         at = height - 2.0 / k * math.tanh(0.5 * k * height)
         center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
-        return cls(
-            frame,
-            share * liquid,
-            tuple(center.tolist()),
-            omega / (2.0 * math.pi),
-            acceleration / omega**2 if pendulum else None,
-            along,
-            damping,
-            name,
-        )
+        position, frequency = tuple(center.tolist()), omega / (2.0 * math.pi)
+        length = acceleration / omega**2 if pendulum else None
+        return cls(frame, share * liquid, position, frequency, length, along, damping, name)
 
     @property
     def title(self) -> str:

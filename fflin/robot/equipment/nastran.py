@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.validation import Array, Mask, vector, whole
@@ -53,10 +54,7 @@ def read_superelement(
     if origin is not None:
         center = vector("origin", origin, 3, "a point") / LENGTHS[length]
     # Convert rigid motions about the file's basic origin to motions about the interface's origin.
-    x, y, z = center
-    shift = np.eye(6)
-    shift[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-    rigid = rigid @ shift
+    rigid = rigid @ pin.SE3(np.eye(3), center).toActionMatrix()
     inertia = rigid.T @ M[np.ix_(boundary, boundary)] @ rigid
     K_b, coupling = K[np.ix_(boundary, boundary)], K[np.ix_(boundary, inner)]
     size = np.abs(rigid).T @ np.abs(K_b) @ np.abs(rigid)

@@ -2,8 +2,8 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -51,7 +51,7 @@ _DEPTH_LIMIT = 1_000
 # Most robots have fewer than 100 links. The limit bounds computing time and memory.
 _LINK_LIMIT = 10_000
 
-# Attributes of <inertia>, in the order in which `Link.inertia` stores them.
+# Attributes of <inertia>: the entries of the upper triangle, row by row.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -77,13 +77,7 @@ class Link(NamedTuple):
     element: Element
     mass: float | None = None  # [kg]; None without <inertial>
     com: Pose = Pose()  # centre of mass, and axes of the inertia
-    inertia: tuple[float, ...] = (0.0,) * 6  # [kg m^2] about the centre of mass, as in INERTIA
-
-    @property
-    def tensor(self) -> Array:
-        """Inertia (3, 3) [kg m^2] about the centre of mass."""
-        xx, xy, xz, yy, yz, zz = self.inertia
-        return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    inertia: Array = np.zeros((3, 3))  # [kg m^2] about the centre of mass
 
 
 class Mimic(NamedTuple):
@@ -115,9 +109,8 @@ class JointElement(NamedTuple):
         return FREEDOM[self.type]
 
 
-def read_link(element: Element) -> Link:
+def read_link(name: str, element: Element) -> Link:
     """Read a <link>, or raise `UrdfError` if it is invalid."""
-    name = element.text("name")
     element.refuse_near_miss("inertial")
     for misplaced in element.find_all("mass"):
         raise misplaced.error(f"<mass> is directly in {element.title}; put it into an <inertial>")
@@ -129,7 +122,9 @@ def read_link(element: Element) -> Link:
     mass = weight.number("value")
     if mass < 0.0:
         raise weight.error(f"{weight.title} is {mass:g} kg, expected 0 or more; correct it")
-    return Link(name, element, mass, read_pose(inertial), tuple(map(inertia.number, INERTIA)))
+    xx, xy, xz, yy, yz, zz = map(inertia.number, INERTIA)
+    tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    return Link(name, element, mass, read_pose(inertial), tensor)
 
 
 def read_pose(element: Element) -> Pose:
@@ -155,10 +150,9 @@ def read_pose(element: Element) -> Pose:
     return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
 
 
-def read_joint(element: Element) -> JointElement:
+def read_joint(name: str, element: Element) -> JointElement:
     """Read a <joint>, or raise `UrdfError` if it is invalid."""
-    name, of = element.text("name"), element.title
-    kind = element.text("type")
+    kind, of = element.text("type"), element.title
     if kind not in FREEDOM:
         raise element.error(f"{of} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}")
     element.refuse_near_miss("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
@@ -197,9 +191,7 @@ def read_joint(element: Element) -> JointElement:
 def _limits(found: Element) -> dict[str, float]:
     """Return the valid limits; an invalid one causes only a note, because A and B ignore limits."""
     limits: dict[str, float] = {}
-    for name in ("lower", "upper", "effort", "velocity"):
-        if name not in found.attributes:
-            continue
+    for name in (x for x in ("lower", "upper", "effort", "velocity") if x in found.attributes):
         value = decimal(found.attributes[name].strip())
         if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
             found.note(
@@ -251,9 +243,6 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
     return {name: resolved[name] for name in written}
 
 
-Part = TypeVar("Part", Link, JointElement)
-
-
 def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
     """Check the elements of a URDF, and return its links and its joints in the file's order."""
     if root.tag != "robot":
@@ -270,7 +259,7 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
                     f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
-    links = _by_name(read_link, root.find_all("link"))
+    links = {name: read_link(name, element) for name, element in _by_name(root, "link").items()}
     if not 0 < len(links) <= _LINK_LIMIT:
         raise root.error(
             "<robot> has no <link>; add one"
@@ -278,22 +267,22 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
             else f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links "
             "that are fixed to each other"
         )
-    joints = _by_name(read_joint, root.find_all("joint"))
+    joints = {name: read_joint(name, element) for name, element in _by_name(root, "joint").items()}
     _check_tree(root, links, joints)
     return links, joints
 
 
-def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[str, Part]:
-    parts: dict[str, Part] = {}
-    for element in elements:
-        part = read(element)
-        earlier = parts.setdefault(part.name, part)
-        if earlier is not part:
+def _by_name(root: Element, tag: str) -> dict[str, Element]:
+    """Return {name: element} of the children with a tag; raise `UrdfError` for a repeated name."""
+    found: dict[str, Element] = {}
+    for element in root.find_all(tag):
+        name = element.text("name")
+        if (earlier := found.setdefault(name, element)) is not element:
             raise element.error(
-                f"a second {element.tag} has the name {quoted(part.name)}, which is already used "
-                f"in line {earlier.element.line}; rename one of them"
+                f"a second {tag} has the name {quoted(name)}, which is already used in line "
+                f"{earlier.line}; rename one of them"
             )
-    return parts
+    return found
 
 
 def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> None:
@@ -355,7 +344,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
-        least, middle, largest = np.linalg.eigvalsh(link.tensor).tolist()
+        least, middle, largest = np.linalg.eigvalsh(link.inertia).tolist()
         if is_impossible(link.mass or 0.0, (least, middle, largest)):
             joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
             of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]
@@ -367,7 +356,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             negligible.append(link.name)
         elif largest - middle - least > TRIANGLE_SLACK * abs(largest):
             unequal.append(link.name)
-        if not link.mass and any(link.inertia):
+        if not link.mass and link.inertia.any():
             weightless.append(link.name)
     lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (

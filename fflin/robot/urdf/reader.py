@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import MissingPackageError, UrdfError
@@ -86,8 +87,8 @@ def describe(document: bytes, path: Path) -> Urdf:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
-    moving = [joint.name for joint in joints.values() if joint.freedom]
-    if sorted(model.names) != sorted(["universe", root_joint, *moving]):
+    names = {"universe", root_joint, *(joint.name for joint in joints.values() if joint.freedom)}
+    if set(model.names) != names or len(names) != model.njoints:
         raise UrdfError(
             f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
             "joints with unusual names"
@@ -150,7 +151,8 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
     for link in links.values():
         inertial = ""
         if link.mass is not None:
-            inertia = _tag("inertia", dict(zip(INERTIA, link.inertia, strict=True)))
+            entries = link.inertia[np.triu_indices(3)].tolist()
+            inertia = _tag("inertia", dict(zip(INERTIA, entries, strict=True)))
             mass = _tag("mass", {"value": link.mass})
             inertial = _tag("inertial", {}, _origin(link.com) + mass + inertia)
         parts.append(_tag("link", {"name": link.name}, inertial))
