@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -97,6 +97,8 @@ class Prepared:
             "mean_motion": robot.orbit.mean_motion if robot.orbit else 0.0,
             "_robot": robot,
         }
+        if not self.own_reference:
+            self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
         for signal, of in signals:
             self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
@@ -108,11 +110,6 @@ class Prepared:
             "u0": frozen(np.zeros(nu)),
             "v": frozen(np.zeros(robot.nv)),
         }
-
-    @cached_property
-    def reference(self) -> Array:
-        """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
-        return frozen(pin.SE3ToXYZQUAT(self.map.reference))
 
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
@@ -237,8 +234,6 @@ class Linearizer:
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
             slow["placement"] = partial(own_reference, robot)
-        else:
-            self._fields["placement"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Whether only B must be computed for a model at rest. This requires default inputs, outputs
@@ -265,6 +260,17 @@ class Linearizer:
             # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
+
+    def write_by_u(self, q: Array, out: Array) -> None:
+        """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
+        inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
+        with self._lock:
+            inverse = out if actuation.default else np.empty((nv, nv))
+            inertia.invert(q, inverse)
+            if not actuation.default:
+                # The input matrix does not depend on the base position. So the base is moved to the
+                # origin, which avoids rounding errors.
+                np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy cannot share the work space, so the constructor builds it again.
