@@ -334,7 +334,7 @@ class SweepTask:
             **{key: rows[0] for key, rows in self._known.items()},
         }
         if not prepared.own_reference:
-            constants["_reference"] = prepared.reference
+            constants["_reference"] = prepared.common["placement"]
         # Value of each array that is the same at all points.
         self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
 
@@ -382,7 +382,7 @@ class SweepTask:
             {
                 "robot": repr(settings),
                 "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
-                "reference": prepared.reference,
+                "reference": prepared.common["placement"],
                 **self._known,
                 **{f"of q: {key}": value for key, value in points.items()},
             }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -16,12 +15,9 @@ from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
-
 
 # Rounding error of M a, of accelerations and of principal moments of inertia. It is relative to the
 # terms that are summed.

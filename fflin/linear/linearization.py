@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -97,6 +97,8 @@ class Prepared:
             "mean_motion": robot.orbit.mean_motion if robot.orbit else 0.0,
             "_robot": robot,
         }
+        if not self.own_reference:
+            self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
         for signal, of in signals:
             self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
@@ -108,11 +110,6 @@ class Prepared:
             "u0": frozen(np.zeros(nu)),
             "v": frozen(np.zeros(robot.nv)),
         }
-
-    @cached_property
-    def reference(self) -> Array:
-        """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
-        return frozen(pin.SE3ToXYZQUAT(self.map.reference))
 
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
@@ -237,8 +234,6 @@ class Linearizer:
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
             slow["placement"] = partial(own_reference, robot)
-        else:
-            self._fields["placement"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Whether only B must be computed for a model at rest. This requires default inputs, outputs
