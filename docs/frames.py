@@ -14,7 +14,7 @@ import numpy as np
 
 import fflin
 from fflin.batch.run import Execution
-from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, Loop, settle
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -34,7 +34,7 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         x = (x - loop.start)[None]
         for frame in FRAMES:
             there = Loop(robot, replace(lin, frame=frame), loop.K)
-            runs_of = partial(settling_runs, there, False, None, 0.0, "python")
+            runs_of = partial(there.runs, False, None, 0.0, "python")
             arrays = settle(runs_of, x, Execution())
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))

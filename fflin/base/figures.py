@@ -76,7 +76,6 @@ def require_matplotlib() -> None:
     try:
         optional_package("matplotlib", "figures need matplotlib", "plot")
     except ValueError as error:  # invalid MPLBACKEND or settings file
-        said = str(error).partition(";")[0]
-        raise MissingPackageError(
-            f"matplotlib cannot be loaded: {said}; correct MPLBACKEND"
-        ) from None
+        why = str(error).partition(";")[0]
+        said = f"matplotlib cannot be loaded: {why}; correct MPLBACKEND"
+        raise MissingPackageError(said) from None

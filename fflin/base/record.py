@@ -78,9 +78,8 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # each decoder raises its own types
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
-        raise FileError(
-            f"{writing.shown(path)}: not a {what} saved by fflin ({writing.reason(error)})"
-        ) from None
+        why = writing.reason(error)
+        raise FileError(f"{writing.shown(path)}: not a {what} saved by fflin ({why})") from None
 
 
 def require_finite(record: Mapping[str, object]) -> None:
@@ -121,8 +120,7 @@ def content_digest(entries: Mapping[str, object]) -> str:
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for key, value in sorted(entries.items()):
-            raw = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
-            array = np.asarray(raw)
+            array = np.asarray(np.frombuffer(value, "u1") if isinstance(value, bytes) else value)
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]

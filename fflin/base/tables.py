@@ -124,7 +124,6 @@ def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str
         for name, value, unit in zip(names, values.tolist(), units, strict=True)
         if value
     ]
-    text = textwrap.fill(
-        f"{title}: {', '.join(entries)}", width(), subsequent_indent=" " * (len(title) + 2)
-    )
+    below = " " * (len(title) + 2)
+    text = textwrap.fill(f"{title}: {', '.join(entries)}", width(), subsequent_indent=below)
     return text.replace("\xa0", " ")

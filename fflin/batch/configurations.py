@@ -5,8 +5,8 @@ Configurations are given as an array, or generated on demand by a grid or a rand
 
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -19,10 +19,6 @@ from fflin.dynamics.points import configuration
 from fflin.robot.fields import travel_of
 from fflin.robot.joints import ROUND_OFF, Joint, by_joint
 from fflin.robot.robot import Robot
-
-# Two indices into q for a joint, and a factor. A continuous joint has the indices of (cos, sin);
-# any other joint has -1 as its second index. The factor is the entry of q for a joint value of 1.
-Column: TypeAlias = tuple[int, int, float]
 
 # Rows are checked in blocks of this size, which limits the memory for intermediate results.
 _BLOCK = 2048
@@ -264,32 +260,19 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
     return q
 
 
-def values(q: Array, column: Column) -> Array:
-    """Return a joint's angle or length (N,) at configurations (N, nq)."""
-    first, second, scale = column
-    at: Array = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
-    return at / scale
+def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
+    """Return configurations of a robot: a corrected array (N, nq), or points that are generated.
 
-
-def positions(q: Array, columns: Sequence[Column]) -> Array:
-    """Return the angles and lengths (N, joints) at configurations (N, nq)."""
-    found = [values(q, column) for column in columns]
-    return np.column_stack(found) if found else np.empty((len(q), 0))
-
-
-def away(q: Array, column: Column, value: float) -> Array:
-    """Return the distances (N,) of a joint's values from `value`.
-
-    For a continuous joint, the distance is the length of the shorter arc.
+    The rows of the array satisfy `Robot.checked_configuration`.
     """
-    distance = values(q, column) - value
-    if column[1] >= 0:
-        distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
-    return np.abs(distance)
-
-
-def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
-    """Return a copy of configurations (N, nq) that satisfy `Robot.checked_configuration`."""
+    if isinstance(q, Grid | RandomConfigurations):
+        # The robot of the points can have other inputs or outputs, but must have equal joints.
+        if q.robot.joints != robot.joints:
+            raise InputError(
+                f"q was made for '{q.robot.name}', whose joints differ from the joints of "
+                f"'{robot.name}'; make q for the robot that is swept"
+            )
+        return replace(q, robot=robot)
     rows = _rows("q", q, robot.nq, "one configuration in Pinocchio's order per row")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
@@ -297,10 +280,8 @@ def checked_configurations(robot: Robot, q: ArrayLike) -> Array:
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-            # A finite sum shows that all entries are finite.
-            finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
         # Comparisons with NaN are false, so rows with NaN count as doubtful.
-        doubtful = ~((excess <= ROUND_OFF) & finite)
+        doubtful = ~((excess <= ROUND_OFF) & np.isfinite(block).all(axis=1))
         if robot.followers:
             followed = block.copy()
             robot.follow(followed.T)
@@ -330,11 +311,7 @@ def checked_rows(
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))
     rows = _rows(name, given, size, "one row for each point", count)
-    with np.errstate(all="ignore"):
-        # A finite sum shows that all entries are finite.
-        sure = not every and np.isfinite(rows.sum())
-    doubtful = np.zeros(count) if sure else ~np.isfinite(rows).all(axis=1) | every
-    for row in np.flatnonzero(doubtful).tolist():
+    for row in np.flatnonzero(~np.isfinite(rows).all(axis=1) | every).tolist():
         with located(f"row {row}"):
             check(rows[row])
     return frozen(rows)

@@ -117,29 +117,24 @@ def read_rows(
     A constant array is stored without rows, because its value is the same at all points.
     """
     writing.check_ending(path, FORMATS)
-    arrays, texts, verified = (_from_npz if path.suffix == ".npz" else _from_hdf5)(path, verify)
-    return arrays, json.loads(texts["constant"]), texts, verified
-
-
-def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
-    # The file is opened here, because NumPy does not close a file that it finds damaged.
-    with path.open("rb") as handle, NpzFile(handle, allow_pickle=False) as file:
-        entries = {key: file[key] for key in file.files}
-    verified = verify and verify_checksum(entries)
-    entries.pop(CHECKSUM, None)
-    texts = {key: str(entries.pop(key)) for key in list(entries) if entries[key].dtype.kind == "U"}
-    return entries, texts, verified
-
-
-def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
+    if path.suffix == ".npz":
+        # The file is opened here, because NumPy does not close a file that it finds damaged.
+        with path.open("rb") as handle, NpzFile(handle, allow_pickle=False) as entries:
+            arrays = {key: entries[key] for key in entries.files}
+        verified = verify and verify_checksum(arrays)
+        arrays.pop(CHECKSUM, None)
+        names = [key for key, value in arrays.items() if value.dtype.kind == "U"]
+        texts = {key: str(arrays.pop(key)) for key in names}
+        return arrays, json.loads(texts["constant"]), texts, verified
     with hdf5().File(path, "r") as file:
         texts = {key: str(value) for key, value in file.attrs.items() if isinstance(value, str)}
         arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
+    constant = json.loads(texts["constant"])
     checksum, checksums = arrays.pop(CHECKSUM, None), arrays.pop(CHUNK_CHECKSUMS, None)
     if checksum is None or checksums is None or not verify:
-        return arrays, texts, False
-    constants = {key: arrays[key] for key in json.loads(texts["constant"])}
+        return arrays, constant, texts, False
+    constants = {key: arrays[key] for key in constant}
     varying = {key: value for key, value in arrays.items() if key not in constants}
     own = {key: value for key, value in texts.items() if key != "request"}
     if not (
@@ -148,7 +143,7 @@ def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, st
         and np.array_equal(checksums, _chunk_checksums(varying, chunk))
     ):
         raise ValueError(DAMAGED)
-    return arrays, texts, True
+    return arrays, constant, texts, True
 
 
 def _mapped(path: Path, dataset: h5py.Dataset) -> Array:
@@ -229,7 +224,8 @@ class FileStore:
         texts: Mapping[str, str],
     ) -> None:
         self.path, self.part, self.count = path, part_of(path), count
-        self._shapes, self._constants, self._texts = shapes, constants, texts
+        self._shapes, self._constants = shapes, constants
+        self._texts = {**texts, "constant": json.dumps(list(constants))}
         self.resumed = self.part.exists()
         with self._reported():
             if not self.resumed:

@@ -14,8 +14,9 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, Vector, instance, vector
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
+from fflin.control.gain import Gain
 from fflin.control.lqr import lqr
-from fflin.control.optimal.riccati import half_size
+from fflin.control.optimal.riccati import Solution, half_size
 from fflin.control.policies import Feedback, Policy
 from fflin.control.weights import weight
 from fflin.linear.fit import line_up
@@ -174,14 +175,11 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     direct = at_rest and nu >= nv
     for index, L in enumerate(batch.B_lower):
         B = np.concatenate((np.zeros_like(L), L))
-        found = half_size(batch.A[0], B, Q, R) if direct else None
-        if found is not None:
-            K[index], residual[index] = found.K, found.residual
-            margin[index] = found.margin
-            continue
-        with located(f"point {index}"):
-            gain = lqr(batch[index], Q, R)
-        K[index], residual[index], margin[index] = gain.K, gain.residual, gain.margin
+        found: Solution | Gain | None = half_size(batch.A[0], B, Q, R) if direct else None
+        if found is None:
+            with located(f"point {index}"):
+                found = lqr(batch[index], Q, R)
+        K[index], residual[index], margin[index] = found.K, found.residual, found.margin
     return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 

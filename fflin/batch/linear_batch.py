@@ -17,7 +17,6 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.record import reading
 from fflin.base.validation import ArrayLike, frozen
 from fflin.base.writing import as_path
-from fflin.batch.configurations import Column, away, positions, values
 from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
@@ -107,7 +106,7 @@ class LinearBatch(validation.Result):
     locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
-    columns: tuple[Column, ...]
+    columns: tuple[tuple[int, int, float], ...]
     # _x0 is None at rest, because x0 then follows from q. _y0 is None if the output is the state.
     _x0: Array | None
     _y0: Array | None
@@ -179,7 +178,7 @@ class LinearBatch(validation.Result):
     @property
     def joint_positions(self) -> Array:
         """Joint positions (N, n) [rad|m]; angles of continuous joints are in (-pi, pi]."""
-        return positions(self.q, self.columns)
+        return self._positions(self.q)
 
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model nearest to the given joint values [rad|m].
@@ -194,8 +193,8 @@ class LinearBatch(validation.Result):
             If a value is not a finite number, or no value is given.
         """
         distance = np.zeros(len(self))
-        for what, column, value in self._named(joints):
-            distance += away(self.q, column, validation.number(what, value)) ** 2
+        for what, at, turning, value in self._named(joints):
+            distance += _apart(at, turning, validation.number(what, value)) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -209,13 +208,12 @@ class LinearBatch(validation.Result):
             If a value is not a number or a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
-        for what, column, value in self._named(joints):
+        for what, at, turning, value in self._named(joints):
             if isinstance(value, tuple | list):
                 low, high = validation.vector(what, value, 2, "(low, high)")
-                at = values(self.q, column)
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, column, validation.number(what, value)) <= _SAME
+                mask &= _apart(at, turning, validation.number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
@@ -321,18 +319,30 @@ class LinearBatch(validation.Result):
         return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:
-        q_m = positions(q, self.columns)
+        q_m = self._positions(q)
         x0 = np.zeros((len(q), len(self.state_names)))
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         return frozen(x0)
 
-    def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Column, Any]]:
-        """Return (name in messages, column, given value) of each joint in `joints`."""
+    def _positions(self, q: Array) -> Array:
+        """Return the angles and lengths (N, n) of the joints at configurations (N, nq)."""
+        q_m = np.empty((len(q), len(self.columns)))
+        for k, (first, second, scale) in enumerate(self.columns):
+            at = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
+            q_m[:, k] = at / scale
+        return q_m
+
+    def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Array, bool, Any]]:
+        """Return each joint in `joints`: its name in messages, its positions, and a given value.
+
+        The flag before the value is true for a continuous joint.
+        """
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
-        columns = dict(zip(self.joint_names, self.columns, strict=True))
-        return [(f"joint '{name}'", columns[name], value) for name, value in joints.items()]
+        at = {name: self.joint_names.index(name) for name in joints}
+        q_m, turning = self.joint_positions, [second >= 0 for _, second, _ in self.columns]
+        return [(f"joint '{x}'", q_m[:, k], turning[k], joints[x]) for x, k in at.items()]
 
 
 # Names of a batch's fields, grouped by type. Arrays have one row per point. The fields in TEXTS are
@@ -366,6 +376,14 @@ def _checked_fields(
         if found[key].shape[1:] != shape:
             raise ValueError(f"{key} has shape {found[key].shape[1:]} per point, expected {shape}")
     return found
+
+
+def _apart(at: Array, turning: bool, value: float) -> Array:
+    """Return the distances (N,) of joint positions from `value`; of angles, the shorter arc."""
+    distance = at - value
+    if turning:
+        distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
+    return np.abs(distance)
 
 
 def _joints(state_names: Sequence[str]) -> tuple[str, ...]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -18,24 +16,18 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FflinWarning, InputError, located
+from fflin.base.errors import FflinWarning, located
 from fflin.base.record import content_digest
 from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
-from fflin.batch.configurations import (
-    Configurations,
-    Grid,
-    RandomConfigurations,
-    checked_configurations,
-    checked_rows,
-)
+from fflin.batch.configurations import Configurations, checked_points, checked_rows
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
-from fflin.dynamics.rnea import AccelerationDerivatives, Inertia
-from fflin.kernel.compiled import checked_engine
-from fflin.kernel.tree import LANES
-from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.dynamics.rnea import AccelerationDerivatives
+from fflin.kernel.compiled import compiles, numba_is_there
+from fflin.kernel.tree import LANES, batch_tree
+from fflin.linear.linearization import LARGEST, Linearizer, Prepared
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -52,11 +44,10 @@ _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 # Warning filters belong to the whole process, so only one thread at a time changes them.
 _TURN = Lock()
 
-# Attributes that identify a robot, in addition to its Pinocchio model and the springs of its
-# joints.
+# Attributes that identify a robot, in addition to its Pinocchio model.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "gravity", "orbit"),
+    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "orbit"),
 )
 
 
@@ -156,14 +147,8 @@ def sweep(
     """
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    job = ChunkJob(
-        robot,
-        at_rest=v is None and u is None,
-        engine=engine,
-        frame=frame,
-        reference=reference,
-        moving=moving,
-    )
+    linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
+    job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
     task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
@@ -178,7 +163,7 @@ def sweep(
         store = MemoryStore(count, size, task.shapes, task.given)
     else:
         store = FileStore(
-            path, task.request, count, size, task.shapes, task.constants, task.texts()
+            path, task.request, count, size, task.shapes, task.constants, task.header()
         )
     with closing(store), how:
         of_what = "configurations"
@@ -189,6 +174,24 @@ def sweep(
     return batch
 
 
+def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
+    """Return the compiled function for the accelerations, or None if Python computes them."""
+    robot, tree, reason = prepared.robot, batch_tree(prepared.robot), ""
+    if prepared.sensing is not None:
+        reason = "the outputs are not the state"
+    elif not numba_is_there():
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+    elif robot.orbit:
+        reason = f"'{robot.name}' is in orbit"
+    elif tree is None:
+        reason = f"a joint of '{robot.name}' has an unsupported type"
+    if not compiles(engine, lambda: reason) or tree is None:
+        return None
+    from fflin.kernel.derivatives import RowAccelerations
+
+    return RowAccelerations(prepared.map, prepared.actuation, tree)
+
+
 class ChunkJob:
     """Job that linearises chunks of points with `Linearizer`.
 
@@ -196,32 +199,11 @@ class ChunkJob:
     neither is given, the caller sets `at_rest`.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        at_rest: bool,
-        engine: str | None = None,
-        frame: Frame | None = None,
-        reference: pin.SE3 | None = None,
-        moving: bool = False,
-    ) -> None:
-        options: Any = {"frame": frame, "reference": reference, "moving": moving}
-        self._again = partial(type(self), robot, at_rest=at_rest, engine=engine, **options)
-        self.linearizer = Linearizer(robot, **options)
-        prepared = self.linearizer.prepared
-        reason = "" if checked_engine(engine) == "python" else prepared.not_compilable
-        if reason and engine == "compiled":
-            raise InputError(
-                f"engine='compiled' is not possible, because {reason}; leave engine out"
-            )
-        # Compiled function for the accelerations at many points; None if Python computes them.
-        self._kernel: RowAccelerations | None = None
-        if engine != "python" and not reason:
-            self._kernel = prepared.kernel()
+    def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
+        self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
+        self.linearizer, prepared = linearizer, linearizer.prepared
+        self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
-        self._data = robot.create_data()
-        self._inertia = Inertia(prepared.map, self._data)
         # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
         # each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -235,7 +217,7 @@ class ChunkJob:
                 self.shapes["_drift"] = (nx,)
             if prepared.sensing is not None:
                 self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
-        self.row_bytes = 8 * (robot.nq + sum(map(math.prod, self.shapes.values())))
+        self.row_bytes = 8 * (linearizer.robot.nq + sum(map(math.prod, self.shapes.values())))
 
     def __reduce__(self) -> tuple[object, ...]:
         # Only the arguments are pickled, because each worker allocates its own work arrays.
@@ -243,33 +225,22 @@ class ChunkJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
-        left = self.write(rows, out)
+        left, nv = self.write(rows, out), self.shapes["B_lower"][0]
         if not len(left):
             return []
         with _TURN, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
                 with located(f"configuration {start + row}"):
-                    self._write_one(rows, row, out)
+                    if self.only_inertia:
+                        self.linearizer.write_by_u(rows["q"][row], out["B_lower"][row])
+                        continue
+                    point = {key: each[row] for key, each in rows.items()}
+                    lin = self.linearizer(point["q"], point.get("v"), point.get("u0"))
+                    for key, array in out.items():
+                        lower = key == "B_lower"
+                        array[row] = lin.B[nv:] if lower else getattr(lin, key.removeprefix("_"))
         return [str(note.message) for note in caught]
-
-    def _write_one(self, rows: Rows, row: int, out: Mapping[str, Array]) -> None:
-        """Linearise about one point in Python, and write the row of this point."""
-        q, nv = rows["q"][row], self.shapes["B_lower"][0]
-        if not self.only_inertia:
-            point = {key: each[row] for key, each in rows.items()}
-            lin = self.linearizer(q, point.get("v"), point.get("u0"))
-            for key, array in out.items():
-                array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.removeprefix("_"))
-            return
-        inertia, actuation = self._inertia, self.linearizer.prepared.actuation
-        B_lower = out["B_lower"][row]
-        inverse = B_lower if actuation.default else np.empty((nv, nv))
-        inertia.invert(q, inverse)
-        if not actuation.default:
-            # The input matrix does not depend on the base position. So the base is moved to the
-            # origin, which avoids rounding errors.
-            np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=B_lower)
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write rows in compiled code, and return the indices of rows that Python must compute."""
@@ -338,18 +309,10 @@ class SweepTask:
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
         # `_points` generates configurations on demand. `_known` contains the given arrays; a single
         # velocity or input for all points is broadcast to rows.
-        self._points, self._known = None, dict[str, Array]()
-        if isinstance(q, Grid | RandomConfigurations):
-            # The robot of the points can have other inputs or outputs, but must have equal joints.
-            if q.robot.joints != robot.joints:
-                raise InputError(
-                    f"q was made for '{q.robot.name}', whose joints differ from the joints of "
-                    f"'{robot.name}'; make q for the robot that is swept"
-                )
-            self._points = replace(q, robot=robot)
-        else:
-            self._known["q"] = checked_configurations(robot, q)
-        self.count = count = len(self._points or self._known["q"])
+        points = checked_points(robot, q)
+        self._points = None if isinstance(points, np.ndarray) else points
+        self._known = {"q": points} if isinstance(points, np.ndarray) else {}
+        self.count = count = len(points)
         if v is not None:
             every = bool(robot.followers)
             check = robot.checked_velocity
@@ -371,7 +334,7 @@ class SweepTask:
             **{key: rows[0] for key, rows in self._known.items()},
         }
         if not prepared.own_reference:
-            constants["_reference"] = prepared.reference
+            constants["_reference"] = prepared.common["placement"]
         # Value of each array that is the same at all points.
         self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
 
@@ -396,11 +359,10 @@ class SweepTask:
         )
         return LinearBatch(**rows, columns=columns, _asked=common)
 
-    def texts(self) -> dict[str, str]:
-        """Return the strings that a file of the batch contains."""
+    def header(self) -> dict[str, str]:
+        """Return the header of a file of the batch."""
         example = {key: np.empty((1, *shape)) for key, shape in self.shapes.items()}
-        header = self.batch(example | self.rows(0, 1)).header(self.count)
-        return {**header, "constant": json.dumps(list(self.constants))}
+        return self.batch(example | self.rows(0, 1)).header(self.count)
 
     @property
     def request(self) -> str:
@@ -409,7 +371,6 @@ class SweepTask:
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
         placements = [placement.homogeneous for placement in robot.model.jointPlacements]
         settings = [getattr(robot, key) for key in _OF_THE_ROBOT]
-        settings += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
         settings += [prepared.map.frame, prepared.moving, prepared.own_reference]
         settings += [self.job.only_inertia, __version__, pin.__version__, self.count]
         points = dict(vars(self._points)) if self._points else {}
@@ -421,7 +382,7 @@ class SweepTask:
             {
                 "robot": repr(settings),
                 "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
-                "reference": prepared.reference,
+                "reference": prepared.common["placement"],
                 **self._known,
                 **{f"of q: {key}": value for key, value in points.items()},
             }

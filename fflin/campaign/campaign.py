@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import re
@@ -16,7 +15,7 @@ import numpy as np
 from fflin.base import intervals
 from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import Estimate
-from fflin.base.record import reading
+from fflin.base.record import CODECS, reading
 from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
@@ -360,11 +359,8 @@ class Campaign(FrozenArrays):
         if target.suffix == ".csv":
             write_table(target, columns, rows)
             return
-        from scipy.io import savemat
-
-        content = io.BytesIO()
-        savemat(content, {"columns": np.array(columns, dtype=object), "runs": rows})
-        write_atomically({target: content.getvalue()})
+        table = {"columns": np.array([columns], dtype=object), "runs": rows}
+        write_atomically({target: CODECS[".mat"][0](table, True)})
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write the campaign, and strings such as the digest that identifies the call."""

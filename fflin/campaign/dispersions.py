@@ -434,8 +434,8 @@ def turned(direction: object, angles: Array) -> Array:
 def _misaligned(robot: Robot, angles: Array) -> Robot:
     """Return a robot whose thrusters and wheel axes are rotated by angles (nu, 2) [rad]."""
     inputs = list(robot.inputs)
-    for place, item, _, at in _mounted(robot):
-        inputs[place] = _pointed(item, turned(_direction(item), angles[at : at + 1])[0])
+    for place, item, _, at, direction in _mounted(robot):
+        inputs[place] = _pointed(item, turned(direction, angles[at : at + 1])[0])
     return robot.replace(inputs=inputs)
 
 
@@ -450,11 +450,11 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
     bodies = np.zeros((count, tree.bodies.size // 10, 10))
     inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
-    for _, item, own, at in _mounted(robot):
+    for _, item, own, at, before in _mounted(robot):
         joint, placement = find_frame(model, item.frame)
         body = names.index(model.names[joint]) - ROOT
         axes = tree.axes[body].T @ placement.rotation
-        before, after = _direction(item), turned(_direction(item), angles[:, at])
+        after = turned(before, angles[:, at])
         if at in inputs:
             forces = [placement.act(pin.Force(_pointed(item, x).wrench)).vector for x in np.eye(3)]
             columns = np.column_stack(forces)
@@ -473,10 +473,6 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     return {name: each.reshape(count, -1) for name, each in of.items()}
 
 
-def _direction(item: Thruster | ReactionWheel) -> Array:
-    return np.array(item.direction if isinstance(item, Thruster) else item.axis)
-
-
 def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | ReactionWheel:
     """Return a copy of a thruster or wheel that points along another direction."""
     if isinstance(item, Thruster):
@@ -486,10 +482,11 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
 
 def _mounted(
     robot: Robot,
-) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int]]:
-    """Yield (index in `robot.inputs`, item, names, index in u) of each thruster and wheel."""
+) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int, Array]]:
+    """Yield thrusters and wheels: index in `robot.inputs`, item, names, index in u, direction."""
     first = 0
     for place, (item, names) in enumerate(named_inputs(robot.inputs)):
         if isinstance(item, Thruster | ReactionWheel):
-            yield place, item, names, first
+            direction = item.direction if isinstance(item, Thruster) else item.axis
+            yield place, item, names, first, np.array(direction)
         first += len(names)

@@ -19,7 +19,7 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named
+from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named, of_campaign
 from fflin.control.tracking import TrajectoryFeedback, followed
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -358,7 +358,7 @@ def funnel(
     limits = _bounds("within", {} if within is None else within, KINDS)
     how = Execution(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
-    reached = Judge(("outcome",), partial(_outcomes, final, limits, by.P[-1]))
+    reached = partial(_outcomes, final, limits, by.P[-1])
     indices = _indices(motion, by, knots)
     jobs = [runs_from(robot, feedback, *pair, engine, options, reached) for pair in indices]
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
@@ -446,7 +446,7 @@ def runs_from(
     first: int,
     engine: str | None,
     options: Mapping[str, object],
-    judge: Judge | None = None,
+    judge: Judge = of_campaign,
 ) -> CampaignJob:
     """Return a job for runs that start at knot k of the trajectory (`first` of the schedule)."""
     motion, schedule = feedback.trajectory, feedback.schedule

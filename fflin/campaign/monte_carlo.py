@@ -220,7 +220,7 @@ def monte_carlo(
         if earlier and until is None and len(earlier) == runs:
             return replace(earlier, goals=wanted, confidence=confidence, _job=job)
         if store is None:
-            texts = {"header": json.dumps(header), "constant": "[]"}
+            texts = {"header": json.dumps(header)}
             store = files.FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
     made = partial(Campaign.of, header=header, job=job)

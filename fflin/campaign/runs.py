@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from timeit import repeat
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of
 from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, empty, laid_out
+from fflin.kernel.tree import LANES, laid_out
 from fflin.robot.robot import Robot
 from fflin.simulation import lanes
 from fflin.simulation.motion import Motion
@@ -74,14 +74,14 @@ def kind_named(name: str) -> str:
     return f"{of} {kind}".strip()
 
 
-class Judge(NamedTuple):
-    """Evaluation of runs. A job returns its results in place of the arrays of a `Campaign`."""
+# Function that returns {name: result (N, ..)} from the outcomes of N runs; see
+# `CampaignJob.outcome`.
+Judge: TypeAlias = Callable[[Mapping[str, Array]], dict[str, Array]]
 
-    fields: tuple[str, ...]  # names of the results
-    # Function that returns {name: result (N,)} from the outcomes of N runs. The first entry of a
-    # history is the start of the run.
-    figures: Callable[[Mapping[str, Array]], dict[str, Array]]
-    over: Over | None = None  # condition that ends a run early
+
+def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the outcomes that are arrays of a `Campaign`."""
+    return {key: values for key, values in outcomes.items() if key != "state_errors"}
 
 
 def kinds_of(state: StateMap) -> Indices:
@@ -105,8 +105,9 @@ def kinds_of(state: StateMap) -> Indices:
 class CampaignJob:
     """Job for runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    Without dispersions, the drawn values are the deviations of the initial state. A `judge` can end
-    runs early; the job then returns the results of the judge, not the arrays of a `Campaign`.
+    Without dispersions, the drawn values are the deviations of the initial state. The arrays of the
+    result are those that `judge` returns. The condition `over` can end runs early; it needs
+    histories, because it compares errors with the initial errors.
     """
 
     def __init__(
@@ -117,19 +118,21 @@ class CampaignJob:
         seed: int,
         engine: str | None,
         options: Mapping[str, object],
-        judge: Judge | None = None,
+        judge: Judge = of_campaign,
+        over: Over | None = None,
     ) -> None:
-        self._again = partial(CampaignJob, robot, policy, given, seed, options=options, judge=judge)
+        again = partial(CampaignJob, robot, policy, given, seed, options=options)
+        self._again = partial(again, judge=judge, over=over)
         settings: dict[str, Any] = dict(options)
-        # A judge compares errors with the initial errors, so the histories contain the start.
-        histories = settings.pop("histories", 0 if judge is None else 1)
+        histories = settings.pop("histories", 0)
         unlimited = settings.pop("unlimited", False)
         settings |= {"robot": robot, "policy": policy, "linear": False, "progress": False}
         self.plan = Plan(SimulationOptions(**settings))
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
             self.plan = self.plan.replace(limits=Saturation(-most, most))
-        self.judge, self.plant, times = judge, self.plan.plant, self.plan.times
+        self.judge, self.over = judge, over
+        self.plant, times = self.plan.plant, self.plan.times
         self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
@@ -149,15 +152,15 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # `outcome_shapes` has the shape, per run, of each array of an outcome; it is read from the
-        # outcome of a run without steps. `shapes` has the shapes of the arrays of the job's result.
+        # `outcome_shapes` has the shape, per run, of each array of an outcome, and `shapes` of each
+        # array of the job's result. They are read from the outcome of a run without steps.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
-        self.outcome_shapes = {key: x.shape for key, x in self.outcome(none).items()}
-        self.shapes: dict[str, tuple[int, ...]] = dict.fromkeys(judge.fields if judge else (), ())
-        if judge is None:
-            self.shapes |= self.outcome_shapes
-            del self.shapes["state_errors"]
+        outcome = self.outcome(none)
+        self.outcome_shapes = {key: x.shape for key, x in outcome.items()}
+        with np.errstate(invalid="ignore"):  # this outcome has no initial error
+            results = judge({key: x[None] for key, x in outcome.items()})
+        self.shapes = {key: x.shape[1:] for key, x in results.items()}
 
     def __reduce__(self) -> tuple[object, ...]:
         # A worker constructs the job again, because functions that are bound to a robot cannot be
@@ -193,9 +196,8 @@ class CampaignJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
-        drawn, found, judge = np.asarray(rows["drawn"]), out, self.judge
-        if judge:
-            found = {k: np.empty((len(drawn), *x)) for k, x in self.outcome_shapes.items()}
+        drawn = rows["drawn"]
+        found = {key: np.empty((len(drawn), *x)) for key, x in self.outcome_shapes.items()}
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
             eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
@@ -210,9 +212,8 @@ class CampaignJob:
                 outcome = self._one(own)
                 for key, values in found.items():
                     values[row] = outcome[key]
-        if judge:
-            for key, values in judge.figures(found).items():
-                out[key][:] = values
+        for key, values in self.judge(found).items():
+            out[key][:] = values
         return []
 
     def errors(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -274,7 +275,7 @@ class CampaignJob:
     def _one(self, drawn: Array) -> dict[str, Array]:
         """Simulate the run with the drawn values (k,) in Python, and return its outcome."""
         plan = self.plan_of(drawn)
-        if over := self.judge and self.judge.over:
+        if over := self.over:
             first = self.errors(plan.q[None], plan.v[None])[1]
 
             def stops(t: float, q: Array, v: Array) -> float:
@@ -314,24 +315,18 @@ class RunStatistics(lanes.Statistics):
     span = LOOK
 
     def __init__(self, job: CampaignJob) -> None:
-        self._job, self._state, self._steps = job, (state := job.plant.state), job.steps
-        self._over = job.judge and job.judge.over
-        if self._over is None:
+        self._job, self._state, target = job, job.plant.state, job.target
+        if job.over is None:
             self.span = _LONG
-        plan, target, steps, path = job.plan, job.target, job.steps, job.path
-        robot, kinds, nu = state.robot, len(KINDS), len(plan.initial)
+        state, initial, kinds, times = self._state, job.plan.initial, len(KINDS), len(job.steps)
         first = target if target.ndim == 1 else target[0]
         x, y, z = first[:3].tolist()
         attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
-        law, marks = lanes.no_law(state, plan.initial), empty(loop.RUN_STATISTICS)
+        law = lanes.no_law(state, initial)
         law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
-        q_ref, nu_ref = path or (np.zeros(0), np.zeros(0))
-        marks = marks._replace(
-            robot=marks.robot._replace(
-                index=np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
-                circling=np.array([joint.unbounded for joint in robot.joints], dtype=bool),
-                scale=np.array([joint.scale for joint in robot.joints]),
-            ),
+        q_ref, nu_ref = job.path or (np.zeros(0), np.zeros(0))
+        marks = loop.RunStatistics(
+            robot=lanes.mechanics_of(job.plant),
             law=law._replace(near=first[state.groups.q_m]),
             path=law.path,
             x_ref=first,
@@ -340,16 +335,16 @@ class RunStatistics(lanes.Statistics):
             kind=kinds_of(state),
             settled=SETTLED,
             tolerance=np.full(kinds, THERE),
-            steps=steps,
-            at=marks.at._replace(q=np.zeros(robot.nq), nu=np.zeros(state.nx // 2)),
+            steps=job.steps,
+            at=law.path.point,
             sizes=np.zeros(kinds),
             largest_x=np.zeros(state.nx),
-            largest_u=np.zeros(nu),
+            largest_u=np.zeros(len(initial)),
             largest=np.zeros(kinds),
             outside=np.full(kinds, -1.0),
-            errors=np.full(len(steps) * kinds, np.inf),
-            inputs=np.zeros(len(steps) * nu),
-            states=np.full(len(steps) * state.nx, np.nan),
+            errors=np.full(times * kinds, np.inf),
+            inputs=np.zeros(times * len(initial)),
+            states=np.full(times * state.nx, np.nan),
         )
         self._marks, self._words, self._fresh = laid_out(marks, loop.RUN_STATISTICS)
 
@@ -360,10 +355,8 @@ class RunStatistics(lanes.Statistics):
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return the mask (LANES,) of runs that the judge ends at q and v (LANES, ..)."""
-        if self._over is None:
-            return np.zeros(LANES, dtype=bool)
-        first = _by_run(self._marks.states[: self._state.nx])
-        return self._over(first, self._job.errors(q, v)[1])
+        over, first = self._job.over, _by_run(self._marks.states[: self._state.nx])
+        return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
 
     def add(self, first: int, rows: Array) -> None:
         """Add steps from step `first` on; `rows` (steps, width, LANES) has q, nu, u and more."""
@@ -374,7 +367,7 @@ class RunStatistics(lanes.Statistics):
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
         """Return the outcomes of eight runs after `done` steps; `stop` has indices into STOPS."""
-        (q, nu, u), marks, times = self._last, self._marks, len(self._steps)
+        (q, nu, u), marks, times = self._last, self._marks, len(self._job.steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
         return dict(

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import EDGE, CampaignJob, Judge, completed
+from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -47,7 +47,6 @@ class Loop:
 
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
         instance("robot", robot, Robot, "a fflin.Robot")
-        instance("lin", lin, LinearModel, "a fflin.LinearModel")
         K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
         kept = getattr(gain, "regulated", ())
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
@@ -123,93 +122,82 @@ class Loop:
         x[self.model_states] = moved[self.model_states]
         return x
 
+    def runs(
+        self, predicts: bool, limits: object, joint: float, engine: str | None, fine: int = 0
+    ) -> CampaignJob:
+        """Return a job that simulates the loop from displaced states.
 
-def settling_runs(
-    loop: Loop,
-    predicts: bool,
-    limits: object,
-    joint: float,
-    engine: str | None = None,
-    fine: int = 0,
-) -> CampaignJob:
-    """Return a job that simulates the loop from displaced states.
+        A run ends when it settles or diverges, or at a horizon. With `predicts`, a run always lasts
+        three time constants and is compared with the linear loop. `joint` is the largest
+        displacement of a joint. `fine` is the number of times that the steps have been shortened.
+        """
+        lin, decay = self.lin, self.decay
+        # The step is also limited by the poles of the open loop, because the loop is open between
+        # samples and at saturation.
+        free = linearize(self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
+        rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
+        fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
+        horizon = (_CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)) / decay
+        pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
+        every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
+        dt = lin.dt / every if lin.dt else _STEP / pace
+        if not horizon / dt <= _MOST_STEPS:
+            raise InputError(
+                f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
+                f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
+                f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
+            )
+        if predicts and not lin.dt:
+            every = max(1, int(horizon / dt / _CHECKS))
+        checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
+        dt, every = dt / finer, every * finer
+        options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
+        # Without `limits`, inputs do not saturate, and thrusts can be negative.
+        options |= {"limits": limits, "unlimited": limits is None, "project": not predicts}
+        options |= {"histories": checks + 1 if predicts else 1}
+        judge = partial(self._judged, self._transition(dt, every) if predicts else None)
+        over, policy = None if predicts else self._is_over, StateFeedback(lin, self.K)
+        return CampaignJob(self.robot, policy, None, 0, engine, options, judge, over)
 
-    A run ends when it settles or diverges, or at a horizon. With `predicts`, a run always lasts
-    three time constants and is compared with the linear loop. `joint` is the largest displacement
-    of a joint. `fine` is the number of times that the steps have been shortened.
-    """
-    lin, decay = loop.lin, loop.decay
-    # The step is also limited by the poles of the open loop, because the loop is open between
-    # samples and at saturation.
-    free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
-    rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
-    fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
-    horizon = (_CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)) / decay
-    pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
-    every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
-    dt = lin.dt / every if lin.dt else _STEP / pace
-    if not horizon / dt <= _MOST_STEPS:
-        raise InputError(
-            f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
-            f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
-            f"{_MOST_STEPS:,}; give a gain with poles of more similar speed, or add damping"
-        )
-    if predicts and not lin.dt:
-        every = max(1, int(horizon / dt / _CHECKS))
-    checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
-    dt, every = dt / finer, every * finer
-    options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
-    options |= {"limits": limits, "project": not predicts}
-    # Without `limits`, inputs do not saturate, and thrusts can be negative.
-    options |= {"unlimited": limits is None}
-    options |= {"histories": checks + 1} if predicts else {}
-    step = _transition(loop, dt, every) if predicts else None
-    figures, over = partial(_figures, loop, step), None if predicts else partial(_is_over, loop)
-    judge = Judge(("outcome", "error"), figures, over)
-    return CampaignJob(loop.robot, StateFeedback(lin, loop.K), None, 0, engine, options, judge)
+    def _transition(self, dt: float, every: int) -> Array:
+        """Return the transition matrix of the linear loop from one check to the next.
 
+        For a linear system, the integrator CF4 equals the classical Runge-Kutta method. Each step
+        then multiplies the state by a fourth-order Taylor polynomial of the matrix exponential. The
+        linear loop uses the same polynomial, so the simulated loop differs only by nonlinear terms.
+        """
+        if self.lin.dt:
+            return self.rate
+        one, Z = np.eye(len(self.rate)), self.rate * dt
+        step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
+        return np.linalg.matrix_power(step, every)
 
-def _transition(loop: Loop, dt: float, every: int) -> Array:
-    """Return the transition matrix of the linear loop from one check to the next.
+    def _is_over(self, first: Array, e: Array) -> Mask:
+        """Return the mask (N,) of settled or diverged runs.
 
-    For a linear system, the integrator CF4 equals the classical Runge-Kutta method. Each step then
-    multiplies the state by a fourth-order Taylor polynomial of the matrix exponential. The linear
-    loop uses the same polynomial, so the simulated loop differs only by nonlinear terms.
-    """
-    if loop.lin.dt:
-        return loop.rate
-    one, Z = np.eye(len(loop.rate)), loop.rate * dt
-    step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
-    return np.linalg.matrix_power(step, every)
+        `first` (N, nx) are the initial state errors, and `e` (N, nx) the present state errors.
+        """
+        first, size = (self.size(each[:, self.model_states]) for each in (first, e))
+        over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
+        return over
 
+    def _judged(self, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
+        """Return each run's outcome, an index into OUTCOMES, and its relative prediction error.
 
-def _is_over(loop: Loop, first: Array, e: Array) -> Mask:
-    """Return the mask (N,) of settled or diverged runs.
-
-    `first` (N, nx) are the initial state errors, and `e` (N, nx) the present state errors.
-    """
-    first, size = (loop.size(each[:, loop.model_states]) for each in (first, e))
-    over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
-    return over
-
-
-def _figures(loop: Loop, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the outcome of each run, an index into OUTCOMES, and its relative prediction error.
-
-    `step` is the transition matrix of the linear loop from one history entry to the next. If it is
-    None, runs are not compared with the linear loop.
-    """
-    e, stop = runs["state_errors"][:, :, loop.model_states], runs["stop"]
-    last, first = loop.size(runs["x"][:, loop.model_states] - loop.lin.x0), loop.size(e[:, 0])
-    turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
-    diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
-    code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
-    apart, predicted = np.zeros(len(e)), e[:, 0]
-    if step is not None:
-        for now in e.swapaxes(0, 1):
-            apart = np.maximum(apart, loop.size(now - predicted))
-            predicted = predicted @ step.T
-    return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
+        `step` is the transition matrix of the linear loop from one history entry to the next. If it
+        is None, runs are not compared with the linear loop.
+        """
+        e, stop = runs["state_errors"][..., self.model_states], runs["stop"]
+        last, first = self.size(runs["x"][:, self.model_states] - self.lin.x0), self.size(e[:, 0])
+        turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
+        diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
+        code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
+        apart, predicted = np.zeros(len(e)), e[:, 0]
+        if step is not None:
+            for now in e.swapaxes(0, 1):
+                apart = np.maximum(apart, self.size(now - predicted))
+                predicted = predicted @ step.T
+        return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
 
 
 def settle(

@@ -14,7 +14,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
-from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -242,23 +242,20 @@ def validity(
 
     streams = np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))
     # The first set of runs measures the prediction error; the second set has random displacements.
-    sets = [
-        (partial(settling_runs, loop, predicts, limits, largest["joint"], engine), starts)
-        for predicts, starts in (
-            (True, displaced(np.tile(_LEVELS, _DIRECTIONS), streams)),
-            (False, displaced(levels, _DIRECTIONS + np.arange(samples))),
-        )
-    ]
-    total, done, found = sum(len(starts) for _, starts in sets), 0, []
+    first = displaced(np.tile(_LEVELS, _DIRECTIONS), streams)
+    second = displaced(levels, _DIRECTIONS + np.arange(samples))
+    predicting, settling = (
+        partial(loop.runs, predicts, limits, largest["joint"], engine) for predicts in (True, False)
+    )
+    total = len(first) + samples
     with how:
         # A random run usually settles after 1 / PATIENCE of the largest duration, and then ends.
-        counts = len(streams), math.ceil(samples / PATIENCE)
-        expect(progress, [(of(), x, n) for (of, x), n in zip(sets, counts, strict=True)], how)
-        for runs_of, starts in sets:
-            told = progress and partial(_report, progress, done, total)
-            found.append(settle(runs_of, starts, how, told))
-            done += len(starts)
-    predicted, random = found
+        few = math.ceil(samples / PATIENCE)
+        expect(progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
+        told = progress and partial(_report, progress, 0, total)
+        predicted = settle(predicting, first, how, told)
+        told = progress and partial(_report, progress, len(first), total)
+        random = settle(settling, second, how, told)
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])

@@ -38,10 +38,7 @@ TASKS = {
 }
 
 # Commands of the module `control`; the module `models` defines all other commands.
-_CONTROL = (
-    *("lqr", "tvlqr", "plan", "simulate", "export"),
-    *("montecarlo", "validity", "funnel", "sweep"),
-)
+_CONTROL = "lqr tvlqr plan simulate export montecarlo validity funnel sweep"
 
 # For files with these endings, the report shows the file size.
 _PAGES = (".html", ".gif")
@@ -135,7 +132,7 @@ def _parser(asked: str) -> parser.Command:
     for task, names in TASKS.items():
         group = main.add_argument_group(task)
         for name in names if not known else {asked} & {*names}:
-            module = "control" if name in _CONTROL else "models"
+            module = "control" if name in _CONTROL.split() else "models"
             parser.add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
         # argparse puts all commands in one group; move them to the group of their task.
         group._group_actions += commands._choices_actions

@@ -275,8 +275,8 @@ def sweep(arguments: Namespace) -> Report:
 
     path, robot = arguments.output_file, load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
-    q, v, u = _points(robot, arguments)
-    size = len(q) * ChunkJob(robot, at_rest=v is None and u is None, **settings).row_bytes
+    linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
+    size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"

@@ -118,11 +118,6 @@ class Law:
     # not finite raises no error.
     slow: float
 
-    @property
-    def advance(self) -> Callable[..., None] | None:
-        """Method that integrates the policy's own state, or None if the policy has no state."""
-        return getattr(self.policy, "advance", None)
-
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())

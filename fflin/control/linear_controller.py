@@ -212,10 +212,8 @@ def growing(policy: object) -> tuple[str, ...]:
     if not isinstance(by, LinearController):
         return ()
     hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
-    for what, matrix, advice in (
-        ("linear loop", by.loop, hint),
-        ("controller by itself", by.system.A, ""),
-    ):
+    systems = ("linear loop", by.loop, hint), ("controller by itself", by.system.A, "")
+    for what, matrix, advice in systems:
         poles = np.linalg.eigvals(matrix)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
@@ -224,13 +222,12 @@ def growing(policy: object) -> tuple[str, ...]:
     return tuple(said)
 
 
-def closed_loop(policy: object) -> tuple[Array, float, tuple[str, ...]] | None:
-    """Return the closed-loop matrix, dt [s] and state names, or None if the loop is not linear."""
+def closed_loop(policy: object) -> tuple[Array, float] | None:
+    """Return the closed-loop matrix and dt [s], or None if the loop is not linear."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):
-        own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
-        return by.loop, by.dt, (*by.lin.state_names, *own)
-    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)
+        return by.loop, by.dt
+    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt)
 
 
 class OutputFeedback(LinearController):

@@ -199,7 +199,7 @@ class _Made(NamedTuple):
 
 def _least(search: Search) -> _Made:
     """Return the plan of least effort, with the smallest limit violations of all attempts."""
-    shooting, bounds, cost, best = search.shooting, search.bounds, search.cost, None
+    shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)
     cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # the guess costs 1
     # If the search with limits between the knots fails, it is repeated with limits at the knots
@@ -213,13 +213,10 @@ def _least(search: Search) -> _Made:
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        made = _Made(q, v, u, missed, at_knots, beyond, float(beyond.max()))
-        if best is None or (made.reached, -made.most) > (best.reached, -best.most):
-            best = made
-        if best.reached and best.most <= _BETWEEN:
+        found.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max())))
+        if found[-1].reached and found[-1].most <= _BETWEEN:
             break
-    assert best is not None
-    return best
+    return max(found, key=lambda made: (made.reached, -made.most))
 
 
 def _require_within(

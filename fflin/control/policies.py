@@ -177,7 +177,7 @@ class AllocatedPolicy:
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
-        self.advance = self._command.advance
+        self.advance: Callable[..., None] | None = getattr(inner, "advance", None)
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 

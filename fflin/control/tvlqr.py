@@ -333,7 +333,7 @@ def tvlqr(
 
     def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)
-        return np.array((A, riccati.spread(B, R), np.broadcast_to(Q, A.shape)))
+        return np.array((A, B @ np.linalg.solve(R, B.mT), np.broadcast_to(Q, A.shape)))
 
     residual = 0.0
     with riccati.bounded_by("smaller weights or a larger R"):

@@ -194,11 +194,8 @@ class CLaw:
     ) -> None:
         source = as_path(folder).resolve()
         self._made = partial(CLaw, source, name=name, compiler=compiler)
-        found = [
-            path.stem
-            for path in source.glob("*.json")
-            if path.with_suffix(".c").is_file() and name in (None, path.stem)
-        ]
+        pairs = [path.stem for path in source.glob("*.json") if path.with_suffix(".c").is_file()]
+        found = [each for each in pairs if name in (None, each)]
         if len(found) != 1:
             raise FileError(
                 f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "

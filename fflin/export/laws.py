@@ -96,9 +96,9 @@ def law_of(given: object, robot: object, limits: object) -> Law:
         )
     robot = instance("robot", robot, Robot, "a Robot")
     if isinstance(given, LinearController | Compensator):
-        law = _output_law(given, lin, robot)
+        law = _output_law(given, robot)
     else:
-        law = _state_law(given, lin, robot)
+        law = _state_law(given, robot)
     names, _ = law.inputs
     high = np.full(len(names), np.inf)
     low = -high
@@ -113,17 +113,17 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     return law
 
 
-def _state_law(given: OfStates, lin: LinearModel | None, robot: Robot) -> Law:
-    axes: dict[str, Array] = {}
+def _state_law(given: OfStates, robot: Robot) -> Law:
+    lin, axes = None, dict[str, Array]()
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
     title = type(given).__name__
     if isinstance(given, TrajectoryFeedback):
-        lin, dt, state = None, given.schedule.dt, given.state_map(robot)
+        dt, state = given.schedule.dt, given.state_map(robot)
         tables = _samples(given, state)
     else:
         if isinstance(given, Gain):
-            dt, given = given.dt, StateFeedback(lin or _model_of(given, robot), given.K)
+            dt, given = given.dt, StateFeedback(given._lin or _model_of(given, robot), given.K)
         else:
             dt = given.lin.dt
         lin = given.lin
@@ -233,9 +233,8 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     }
 
 
-def _output_law(
-    given: LinearController | Compensator, lin: LinearModel | None, robot: Robot
-) -> Law:
+def _output_law(given: LinearController | Compensator, robot: Robot) -> Law:
+    lin = None
     if isinstance(given, LinearController):
         terms, lin = given.terms(), given.lin
         inputs, signals = (lin.input_names, lin.input_units), (lin.output_names, lin.output_units)

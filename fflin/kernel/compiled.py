@@ -7,7 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib import import_module
@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Event, Lock, RLock, Thread
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import unknown
+from fflin.base.errors import InputError, unknown
 from fflin.base.process import Progress
 
 if TYPE_CHECKING:
@@ -69,11 +69,20 @@ def numba_is_there() -> bool:
     return find_spec("numba") is not None
 
 
-def checked_engine(engine: object) -> str | None:
-    """Return an engine's name or None unchanged; raise `UnknownNameError` for anything else."""
+def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
+    """Return whether compiled code computes: if `engine` is not "python", and there is no obstacle.
+
+    `obstacle` returns the reason why compiled code cannot compute, or an empty text. An error is
+    raised for an unknown engine, and for the engine "compiled" if there is an obstacle.
+    """
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
-    return engine
+    if engine == "python":
+        return False
+    reason = obstacle()
+    if reason and engine == "compiled":
+        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
+    return not reason
 
 
 def kernel(module: str, name: str) -> Compiled:

@@ -12,17 +12,9 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, Mask, frozen, instance, share
+from fflin.dynamics import coordinates
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import (
-    ANGULAR,
-    LINEAR,
-    PIN_ANGULAR,
-    PIN_LINEAR,
-    Chart,
-    moving_errors,
-    state_history,
-    times,
-)
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart
 from fflin.dynamics.integrators import integrate_rows
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.rnea import Inertia
@@ -475,7 +467,7 @@ class Nonlinear:
         relative = v.copy()
         relative[:, PIN_LINEAR] -= observer
         a = self._aba.accelerations(q, relative, self._aba.actuation.in_base_axes(chart, u))
-        a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
+        a[:, PIN_LINEAR] -= np.cross(v[:, PIN_ANGULAR], observer)
         return chart, q, v, a
 
     def rates(self, point: Array) -> Array:
@@ -486,14 +478,14 @@ class Nonlinear:
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)
-        turning += times(skew(chart.q_b), angular + at_angular)
-        position_rate = times(chart.R, linear) - at_linear
-        position_rate -= times(skew(at_angular), point[:, state.groups.r_b])
+        turning += np.cross(chart.q_b, angular + at_angular)
+        position_rate = coordinates.times(chart.R, linear) - at_linear
+        position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
             # Components of v in reference axes have another derivative than components in base
             # axes. Add the difference w x v.
-            rate[:, LINEAR] += times(skew(angular), linear)
+            rate[:, LINEAR] += np.cross(angular, linear)
         rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
         joint_rates = state.velocities(v - self._v)[:, 6:]
         return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
@@ -514,9 +506,9 @@ class Nonlinear:
         h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
         t, speeds = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None], np.tile(v, (6, 1))
         moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
-        after = state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
+        after = coordinates.state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
         if lin.moving:  # the first row is also the motion of the reference
-            after = moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
+            after = coordinates.moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
         ahead, behind = after.reshape(2, 3, *x.shape)
         rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
         floor, size = 1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1)

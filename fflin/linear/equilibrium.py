@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid, signals
-from fflin.base.validation import Array, Complex, FrozenArrays, Indices, Mask, instance
+from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance
 from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, Frame, StateMap
 from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
-
 
 # Rounding error of M a, of accelerations and of principal moments of inertia. It is relative to the
 # terms that are summed.
@@ -175,8 +171,17 @@ def equilibrium(
         loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
             break
-        step = state.spread(balance.newton_step(linearizer, soft))
-        at = pin.integrate(robot.model, balance.lin.q, step)
+        lin, step = linearizer(balance.lin.q, v, balance.u), np.zeros(len(soft))
+        hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
+        own = np.sqrt(robot.springs.stiffness[soft[6:]])
+        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
+            weak = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
+            raise EquilibriumError(
+                f"the springs of {weak} are too weak to hold '{robot.name}' at this "
+                "configuration; make them stiffer, or choose another point"
+            )
+        step[soft] = np.linalg.solve(hold, balance.residual[soft])
+        at = pin.integrate(robot.model, lin.q, state.spread(step))
         at[:7] = given[:7]
         balance = _Balance(linearizer, at, v)
         tolerance = np.maximum(tolerance, balance.tolerance)
@@ -229,21 +234,6 @@ class _Balance:
         self.allowed = TOLERANCE * float(np.linalg.norm(target))
         self.allowed += float(np.linalg.norm(mobility * rounding))
         self.residual, self.tolerance = self.left / mobility, rounding + terms
-
-    def newton_step(self, linearizer: Linearizer, soft: Mask) -> Array:
-        """Return the Newton step (6 + n,) that moves only the coordinates in the mask `soft`."""
-        robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
-        hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
-        own = np.sqrt(robot.springs.stiffness[soft[6:]])
-        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
-            names = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
-            raise EquilibriumError(
-                f"the springs of {names} are too weak to hold '{robot.name}' at this "
-                "configuration; make them stiffer, or choose another point"
-            )
-        step: Array = np.zeros(len(soft))
-        step[soft] = np.linalg.solve(hold, self.residual[soft])
-        return step
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,14 +15,12 @@ from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
+from fflin.linear.check import Check, check_all
 from fflin.linear.fit import require_same
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel, refuse_sampled
 from fflin.linear.trajectory import Trajectory, intervals_of
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.linear.check import Check
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,8 +129,6 @@ class LinearTrajectory(Trajectory):
 
     def check(self, *, tolerance: float | None = None) -> Check:
         """Check the linear model at every knot by `fflin.check`, and return the largest errors."""
-        from fflin.linear.check import check_all
-
         title = f"{self.robot.name}, {len(self)} knots"
         return check_all(self.robot, self, title, tolerance=tolerance)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import partial
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,9 +13,9 @@ from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
 from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit
+from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Actuation, Frame, StateMap
-from fflin.kernel.compiled import numba_is_there
 from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
@@ -28,11 +28,6 @@ from fflin.robot.robot import Robot
 # Upper bound of the sum of the squared entries. Larger models are refused, because computing their
 # eigenvalues would overflow.
 LARGEST = 1e200
-
-if TYPE_CHECKING:
-    from fflin.dynamics.outputs import Sensing
-    from fflin.kernel.derivatives import RowAccelerations
-
 
 _STANDING: Chart = Standing()
 
@@ -79,8 +74,6 @@ class Prepared:
         self.actuation = Actuation(state)
         self.sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
-            from fflin.dynamics.outputs import Sensing
-
             self.sensing = Sensing(state, robot.outputs, own_reference=self.own_reference)
         acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
         self.free = self.sensing is None and not moving and not acts
@@ -104,6 +97,8 @@ class Prepared:
             "mean_motion": robot.orbit.mean_motion if robot.orbit else 0.0,
             "_robot": robot,
         }
+        if not self.own_reference:
+            self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
         for signal, of in signals:
             self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
@@ -116,40 +111,12 @@ class Prepared:
             "v": frozen(np.zeros(robot.nv)),
         }
 
-    @cached_property
-    def reference(self) -> Array:
-        """Reference (7,) of `map`: position [m] and quaternion x, y, z, w."""
-        return frozen(pin.SE3ToXYZQUAT(self.map.reference))
-
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
         chart = _STANDING if self.own_reference else state.chart(q)
         r_b = chart.q_b if self.own_reference else state.positions(q)
         return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
-
-    @property
-    def not_compilable(self) -> str:
-        """Reason why the accelerations cannot be compiled, or an empty text if they can."""
-        from fflin.kernel.tree import batch_tree
-
-        name = self.robot.name
-        if self.sensing is not None:
-            return "the outputs are not the state"
-        if not numba_is_there():
-            return "numba is not installed (pip install 'fflin[fast]')"
-        if self.robot.orbit:
-            return f"'{name}' is in orbit"
-        return "" if batch_tree(self.robot) else f"a joint of '{name}' has an unsupported type"
-
-    def kernel(self) -> RowAccelerations:
-        """Return the compiled accelerations; `not_compilable` must be empty."""
-        from fflin.kernel.derivatives import RowAccelerations
-        from fflin.kernel.tree import batch_tree
-
-        tree = batch_tree(self.robot)
-        assert tree is not None
-        return RowAccelerations(self.map, self.actuation, tree)
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
@@ -267,8 +234,6 @@ class Linearizer:
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
             slow["placement"] = partial(own_reference, robot)
-        else:
-            self._fields["placement"] = ready.reference
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Whether only B must be computed for a model at rest. This requires default inputs, outputs
@@ -295,6 +260,17 @@ class Linearizer:
             # `_require_finite` reports an overflow, so NumPy need not warn of it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
+
+    def write_by_u(self, q: Array, out: Array) -> None:
+        """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
+        inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
+        with self._lock:
+            inverse = out if actuation.default else np.empty((nv, nv))
+            inertia.invert(q, inverse)
+            if not actuation.default:
+                # The input matrix does not depend on the base position. So the base is moved to the
+                # origin, which avoids rounding errors.
+                np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # A copy cannot share the work space, so the constructor builds it again.

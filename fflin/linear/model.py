@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
+from fflin.base.writing import as_path
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
     import control
-    import pinocchio as pin
     from scipy import signal
 
     from fflin import ToolModel
@@ -199,8 +200,6 @@ class LinearModel(StateSpace):
     @property
     def reference(self) -> pin.SE3:
         """Placement oMref relative to which the attitude and position of the base are measured."""
-        import pinocchio as pin
-
         return pin.XYZQUATToSE3(self.placement)
 
     @cached_property
@@ -394,7 +393,6 @@ class LinearModel(StateSpace):
         InputError
             If a value is not finite.
         """
-        from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
 
         write_model(as_path(path), record_of(self), checksummed=self.verified)
@@ -408,7 +406,6 @@ class LinearModel(StateSpace):
         FileError
             If the file cannot be read, is damaged or does not contain a linear model.
         """
-        from fflin.base.writing import as_path
         from fflin.linear.files import given, read_model
 
         values, certificate = read_model(as_path(path), Certificate)

@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-import fflin.base.rotation as turning
 from fflin.base.errors import ChartError, InputError, unknown
-from fflin.base.rotation import quaternion_product, skew
+from fflin.base.rotation import product_matrix, quaternion_product, rotation_matrix, skew
 from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, placement, vector
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
@@ -156,7 +155,7 @@ class ToolCoordinates:
             raise InputError(
                 f"the quaternion w, x, y, z has length {length:.9g}, expected 1; normalise it"
             )
-        return turning.rotation_matrix(np.roll(attitude, -1) / length)
+        return rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude in x' as a quaternion x, y, z, w and as a rotation matrix."""
@@ -165,7 +164,7 @@ class ToolCoordinates:
         if self.convention.attitude == "q_b":
             quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
             quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
-        return quaternion, turning.rotation_matrix(quaternion)
+        return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
         """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes."""
@@ -190,9 +189,9 @@ class ToolCoordinates:
         # errors and tangent vectors are constant, so their step is zero.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
-        turns = 0.5 * turning.product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
+        turns = 0.5 * product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
         quaternion = here + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
-        R, w, vec = turning.rotation_matrix(quaternion), quaternion[3], quaternion[:3]
+        R, w, vec = rotation_matrix(quaternion), quaternion[3], quaternion[:3]
         by_turn = -self._rotated(R) @ self._held(twist)
         attitude: Any = np.eye(3) + 0.5 * skew(moved[ANGULAR])
         if kind.attitude == "euler":

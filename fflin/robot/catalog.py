@@ -1,7 +1,7 @@
 """Catalogue of robots: functions that find URDFs, files of inputs and meshes."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -116,15 +116,14 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
     The URI of the mesh is package://NAME/PATH, file:///PATH or a path.
     """
     scheme, separator, rest = uri.partition("://")
-    candidates: Iterable[Path]
     if not separator:
-        candidates = (folder / uri for folder in (urdf.parent, *package_dirs))
+        candidates = [folder / uri for folder in (urdf.parent, *package_dirs)]
     elif scheme == "file":
         candidates = [Path(unquote(rest))]
     else:
         folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
         # A given folder may contain the package folder. Or it may be the package folder itself,
         # possibly under another name.
-        candidates = (folder / part for part in (rest, inside) for folder in folders)
+        candidates = [folder / part for part in (rest, inside) for folder in folders]
     # Unlike `os.path.isfile`, Path.is_file would raise an error for a name that is too long.
     return next((path for path in candidates if os.path.isfile(path)), None)

@@ -13,14 +13,13 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.validation import Array, dimension, number, numbers
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs, three_numbers
-from fflin.robot.joints import by_joint
+from fflin.robot.joints import Joint, by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from fflin.robot.joints import Joint
     from fflin.robot.robot import Robot
 
 # Least and largest value; a value without a limit is infinite.
@@ -167,8 +166,8 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 
 # Checks of the fields, in the order in which a robot file applies them. Inputs come before the
 # fields that refer to the inputs by name. `Robot.replace` checks the first three fields itself.
-FIELDS: dict[str, Callable[[object, Robot], Any]] = {
-    **dict.fromkeys(("passive", "inputs", "appendages"), lambda value, _: value),
+FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
+    **dict.fromkeys(("passive", "inputs", "appendages")),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),

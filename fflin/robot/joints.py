@@ -185,8 +185,7 @@ class Coordinates:
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
         q = pin.neutral(self.model)
-        if self.followers:
-            self.follow(q)
+        self.follow(q)
         return q
 
     def follow(self, q: Array) -> None:
@@ -224,9 +223,9 @@ class Coordinates:
     def _sized(self, name: str, value: ArrayLike, size: int, of_what: str) -> Array:
         """Return a vector (size,); the error for a longer vector names removed coordinates."""
         if self._removed and np.size(value) > size:
-            removed = ", ".join(self._removed)
+            gone = ", ".join(self._removed)
             of_what += (
-                f"; the coordinates {removed} were removed with the replaced inputs or appendages"
+                f"; the coordinates {gone} were removed with the replaced inputs or appendages"
             )
         return vector(name, value, size, of_what)
 
@@ -247,8 +246,7 @@ class Coordinates:
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` if the model was changed in place after the robot was made."""
-        assert self._as_made is not None
-        made = self._as_made[1]
+        made = self._as_made[1] if self._as_made else self.model
         # The comparison takes a microsecond; `change_in` runs only if the models differ.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(

@@ -368,12 +368,10 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     with document.located("package_dirs"):
         dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
     # Nested tables become keys with dots. The parts of weights and states remain tables.
-    values = {
-        key: {part: flat(x) for part, x in value.items()}
-        if key in ("weights", "point", "target", "start") and isinstance(value, dict)
-        else flat(value)
-        for key, value in record.items()
-    }
+    values = {key: flat(value) for key, value in record.items()}
+    for key in ("weights", "point", "target", "start"):
+        if isinstance(table := record.get(key), dict):
+            values[key] = {part: flat(value) for part, value in table.items()}
     if "input" in record:
         values["inputs"] = _read_inputs(document)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
@@ -389,8 +387,7 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file; see `load_inputs`."""
     inputs = tuple(_built(document, "input", _input_type))
     if not inputs:
-        message = "the file contains no inputs; add a table [[input]] with its type"
-        raise InputError(f"{document.path}: {message}")
+        raise document.error("the file contains no inputs; add a table [[input]] with its type")
     return inputs
 
 

@@ -161,6 +161,11 @@ class LinkMass(NamedTuple):
     placement: pin.SE3  # placement of the <inertial> on the link
 
 
+def link_mass(body: pin.Inertia) -> LinkMass:
+    """Return the mass properties of a link from its inertia in the axes of the link."""
+    return LinkMass(body.mass, body.inertia, pin.SE3(np.eye(3), body.lever))
+
+
 class Piece(NamedTuple):
     """Mass properties of a link or of a whole body, and the joint that moves it."""
 
@@ -169,39 +174,38 @@ class Piece(NamedTuple):
     mass: float
     inertia: Array
     frame: pin.SE3  # placement on the joint of the frame in which the centre of mass is given
+    body: str  # name of the whole body: its joint, or "base"
     whole: bool = False  # whether the piece is a body of several links
 
 
-def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
-    """Return {name: piece}, and {body: link} for bodies of one link.
+def pieces_of(robot: Robot) -> dict[str, Piece]:
+    """Return {name: piece} for all links, and for all bodies that have no link or several links.
 
-    The pieces are all links, and all bodies that have no link or several links. For a body of one
-    link, the piece has the name of the link. If the links of a body do not add up to the body, only
-    the body is a piece.
+    For a body of one link, the piece has the name of the link. If the links of a body do not add up
+    to the body, only the body is a piece.
     """
-    model, found, also = robot._bare.model, dict[str, Piece](), dict[str, str]()
+    model, found = robot._bare.model, dict[str, Piece]()
+    bodies = ["base" if joint == ROOT else name for joint, name in enumerate(model.names)]
     of_body: dict[int, dict[str, Piece]] = {}
     for name, link in robot.links.items():
         if model.existFrame(name, pin.FrameType.BODY):
             joint, at = find_frame(model, name)
-            piece = Piece(joint, at * link.placement, link.mass, link.inertia, at)
+            placement, body = at * link.placement, bodies[joint]
+            piece = Piece(joint, placement, link.mass, link.inertia, at, body)
             of_body.setdefault(joint, {})[name] = piece
     for joint in range(ROOT, model.njoints):
-        body, named = model.inertias[joint], of_body.get(joint, {})
-        at, own_axes = pin.SE3(np.eye(3), body.lever), pin.SE3.Identity()
-        whole = Piece(joint, at, body.mass, body.inertia, own_axes, len(named) > 1)
+        inertia, named = model.inertias[joint], of_body.get(joint, {})
+        at, axes, several = pin.SE3(np.eye(3), inertia.lever), pin.SE3.Identity(), len(named) > 1
+        whole = Piece(joint, at, inertia.mass, inertia.inertia, axes, bodies[joint], several)
         total = sum((as_inertia(each) for each in named.values()), pin.Inertia.Zero())
-        difference = np.abs(total.matrix() - body.matrix()).max()
-        if difference <= _ROUNDING * np.abs(body.matrix()).max():
+        difference = np.abs(total.matrix() - inertia.matrix()).max()
+        if difference <= _ROUNDING * np.abs(inertia.matrix()).max():
             found |= named
-        own = "base" if joint == ROOT else model.names[joint]
-        alone = next(iter(named)) if len(named) == 1 else own
-        also |= {own: alone} if alone != own else {}
-        found.setdefault(alone, whole)
+        found.setdefault(next(iter(named)) if len(named) == 1 else bodies[joint], whole)
     # Wheels are inserted between the joints, so a joint has another index than in the bare model.
     now = [robot.model.getJointId(name) for name in model.names]
     now[ROOT] = ROOT
-    return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}, also
+    return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
@@ -258,7 +262,6 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
-    idle: tuple[str, ...] = ()
     # If M is singular at two random configurations, it is almost surely singular at all of them.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
@@ -268,10 +271,9 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
         rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
         involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
-        idle = tuple(dict.fromkeys(names[involved].tolist()))
-        if not idle:
-            break
-    return idle
+        if not involved.any():
+            return ()
+    return tuple(dict.fromkeys(names[involved].tolist()))
 
 
 def coordinate_names(robot: Robot) -> list[str]:
@@ -337,8 +339,7 @@ def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
     if linear.any():  # a joint that translates
         return False
     body, turn = robot.model.inertias[index], skew(axis)
-    inertia = body.inertia
-    uneven = float(np.abs(turn @ inertia - inertia @ turn).max())
-    largest = float(np.abs(inertia).max())
+    uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
+    largest = float(np.abs(body.inertia).max())
     offset = body.mass * float(np.square(turn @ body.lever).sum())
     return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

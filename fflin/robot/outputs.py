@@ -24,7 +24,7 @@ class Output:
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames that the output depends on."""
-        return ()
+        return tuple(getattr(self, name) for name in ("frame", "to") if hasattr(self, name))
 
     @property
     def signals(self) -> list[tuple[str, str]]:
@@ -38,11 +38,6 @@ class FrameOutput(Output):
     """Base class of outputs that depend on one or two frames on the base or on links."""
 
     frame: str
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Names of the model's frames that the output depends on."""
-        return tuple(getattr(self, item.name) for item in fields(self))
 
 
 class FullState(Output):

@@ -240,8 +240,7 @@ class Robot(Coordinates):
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
-        own = ("passive", "inputs", "appendages")
-        checked = {k: FIELDS[k](value, robot) for k, value in fields.items() if k not in own}
+        checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
         # With `merged`, joints that are not named keep their values. Otherwise, only modes do.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
@@ -348,17 +347,13 @@ class Robot(Coordinates):
                 return changed
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
-    @property
-    def pieces(self) -> dict[str, mass_properties.Piece]:
-        """Mass properties {name: piece} of all links, and of all bodies with several links."""
-        return self._links_and_bodies[0]
+    pieces = cached_property(mass_properties.pieces_of)
 
-    @property
+    @cached_property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
-        return self._links_and_bodies[1]
-
-    _links_and_bodies = cached_property(mass_properties.pieces_of)
+        pieces = self.pieces
+        return {each.body: name for name, each in pieces.items() if each.body not in pieces}
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -403,12 +398,9 @@ class Robot(Coordinates):
         for joint in self.joints:
             if joint.name == name:
                 return joint
-        for follower in self.followers:
-            if follower.joint.name == name:
-                raise InputError(
-                    f"joint '{name}' mimics '{follower.leader.name}'; give "
-                    f"'{follower.leader.name}' instead"
-                )
+        leader = {each.joint.name: each.leader.name for each in self.followers}.get(name)
+        if leader:
+            raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")
         if name in (wheel for wheel, _ in named_wheels(self.inputs)):
             raise InputError(
                 f"wheel '{name}' has no inertia, so it is not a joint and has no speed; give the "

@@ -5,7 +5,6 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import Any, cast
 
-import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
@@ -14,7 +13,7 @@ from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
-from fflin.robot.mass_properties import LinkMass, dynamic_parameters
+from fflin.robot.mass_properties import dynamic_parameters, link_mass
 from fflin.robot.outputs import JointOutput
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic
@@ -71,11 +70,8 @@ def locked_model(
     given = joints_by_name("joint to lock", requested(lock), movable, find)
     values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
-        leader_value = values.get(mimic.leader, 0.0) or 0.0
-        if mimic.leader in values or values.get(name, 0.0) is None:
-            values.setdefault(name, None)
-            if values[name] is None:
-                values[name] = mimic.multiplier * leader_value + mimic.offset
+        if values.get(name) is None and (name in values or mimic.leader in values):
+            values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
     q, indices, locked = pin.neutral(model), [], []
     for name, value in values.items():
         index = model.getJointId(name)
@@ -125,30 +121,24 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     model = _appended(bare.model, frame, other.model, placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
-        return joint._replace(name=f"{prefix}.{joint.name}").within(model)
+        return joint._replace(name=f"{prefix}.{joint.name}")
 
-    own = [each.within(model) for each in bare.joints]
-    theirs = [renamed(each) for each in other.joints]
-    followers = [
-        *(f.within(model) for f in bare.followers),
-        *(Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers),
-    ]
+    joints = [each.within(model) for each in (*bare.joints, *map(renamed, other.joints))]
+    theirs = (Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers)
     both: dict[str, Any] = {
         name: getattr(robot, name)
         | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
     if not other.links:  # a single body, whose mass properties get the name of the prefix
-        body = other.model.inertias[ROOT]
-        at_center = pin.SE3(np.eye(3), body.lever)
-        both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
+        both["links"][prefix] = link_mass(other.model.inertias[ROOT])
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     bare = replace(
         bare,
         model=model,
         urdf_sha256=sha256(identity.encode() + dynamic_parameters(model)).hexdigest(),
-        joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
-        followers=tuple(followers),
+        joints=tuple(sorted(joints, key=lambda each: each.idx_v)),
+        followers=tuple(each.within(model) for each in (*bare.followers, *theirs)),
         links=both.pop("links"),
     )
     name, attached = f"{robot.name}+{other.name}", (*robot.attached, (prefix, other))

@@ -20,7 +20,7 @@ from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, d
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
-from fflin.kernel.compiled import checked_engine, is_kept, kernel, numba_is_there
+from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
@@ -46,13 +46,10 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     By default, many runs use the compiled loop if it supports the plan. A single run uses it only
     if the run is long and the machine code has been stored by an earlier run.
     """
-    if checked_engine(engine) == "python":
+    if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
-    reason = not_compilable(plan)
-    if engine == "compiled" and reason:
-        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
     wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
-    return "compiled" if wanted and not reason else "python"
+    return "compiled" if wanted else "python"
 
 
 def not_compilable(plan: Plan) -> str:

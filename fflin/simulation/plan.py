@@ -357,7 +357,7 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
     assert closed is not None
-    loop, dt, _ = closed
+    loop, dt = closed
     step = dt or _LOOK
     if not dt:
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]

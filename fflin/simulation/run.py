@@ -281,7 +281,9 @@ def go(plan: Plan, hint: str = "") -> Recording:
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
-    follow, weights = law and law.advance, plan.method.step_weights(dt)[1]
+    # Method that integrates the policy's own state, or None if the policy has no state.
+    follow = getattr(law.policy, "advance", None) if law else None
+    weights = plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt
     ends = np.cumsum([len(q), len(v), len(plan.initial), 6])
     rows, at, t, stages = np.empty((times.rows, ends[-1] + 3)), list[float](), 0.0, 0

@@ -7,8 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, instance, number, numbers, untied, vector, whole
-from fflin.base.validation import by_name as mapping
+from fflin.base.validation import Array, by_name, instance, number, numbers, untied, vector, whole
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
@@ -256,7 +255,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     given: dict[str, object] = {}
-    for key, value in mapping("ranges", ranges, "parameter").items():
+    for key, value in by_name("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
             given |= {f"{key}.{part}": each for part, each in value.items()}
         else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, Frame, StateMap
@@ -61,7 +62,7 @@ def motion_page(
 ) -> str:
     """Return the page of a motion; see `visualize`."""
     robot, shown = page.robot, frame_indices(motion.t, fps, speed)
-    frame = cast("Frame", motion.frame)
+    frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
     if target is None:  # none, one, or one for each frame
@@ -127,10 +128,9 @@ def motion_page(
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: corners of the bodies, tips of the forces."""
-    chosen = np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
-    for index in chosen:
+    for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
         base = film.poses[index, 0, :3]
         tip = base + ARROW * page.size * film.force[index] / strongest
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)

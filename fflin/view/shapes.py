@@ -175,10 +175,9 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
         sides = np.sqrt(np.maximum(squares, 0.0))
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
-        size = tuple(sides.tolist())
         placement = pin.SE3(axes, inertia.lever)
         link = "base" if joint == ROOT else robot.model.names[joint]
-        yield Shape(joint, "box", size, placement, finish="inertia", link=link)
+        yield Shape(joint, "box", tuple(sides.tolist()), placement, finish="inertia", link=link)
 
 
 class Bending(NamedTuple):

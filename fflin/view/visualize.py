@@ -155,6 +155,8 @@ def visualize(
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     opened = None if open is None else truth("open", open)
     tool = tool_frame(robot, tool)
+    from fflin.view.page import Page
+
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError(
@@ -164,7 +166,6 @@ def visualize(
         port = whole("port", port, 0, 2**16 - 1)
         q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
-        from fflin.view.page import Page
 
         pace = positive("speed", 1.0 if speed is None else speed)
         page = Page(robot, q, scene, tool, frame)
@@ -176,7 +177,6 @@ def visualize(
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     from fflin.analysis.modes import Modes
-    from fflin.view.page import Page
     from fflin.view.pages import mode_page, motion_page
 
     contents: dict[Path, bytes] = {}
@@ -292,8 +292,6 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 def _pictures(
     page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
 ) -> dict[Path, bytes]:
-    if ".png" not in outputs and ".gif" not in outputs:
-        return {}
     from fflin.view.capture import take_gif, take_png
 
     start, end = float(motion.t[0]), float(motion.t[-1])

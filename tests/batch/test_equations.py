@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.batch import sweep
 from fflin.batch.sweep import ChunkJob
 from fflin.kernel.compiled import kernel
-from fflin.linear import linearization
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -47,7 +47,7 @@ def agreement(robot, count=11, **options):
     if options.get("moving"):
         shapes["_drift"] = (nx,)
     out = {key: np.full((count, *shape), np.nan) for key, shape in shapes.items()}
-    job = ChunkJob(robot, at_rest=False, **options)
+    job = ChunkJob(linearizer, at_rest=False)
     assert not len(job.write({"q": q, "v": v, "u0": u}, out))
     worst = 0.0
     for row in range(count):
@@ -171,7 +171,7 @@ def test_angles_beyond_the_kernels_sines_are_left(robots):
     nv, nx = 6 + robot.n, 12 + 2 * robot.n
     out = {"A": (nx, nx), "B_lower": (nv, u.shape[1]), "f0": (nx,), "_x0": (nx,)}
     arrays = {key: np.zeros((20, *shape)) for key, shape in out.items()}
-    job = ChunkJob(robot, at_rest=False)
+    job = ChunkJob(fflin.Linearizer(robot), at_rest=False)
     assert job.write({"q": q, "v": v, "u0": u}, arrays).tolist() == [3]
 
 
@@ -195,7 +195,7 @@ def test_an_engine_may_be_chosen(robots, monkeypatch):
     assert compiled.A == pytest.approx(by_python.A, rel=1e-9, abs=1e-9)
     with pytest.raises(fflin.UnknownNameError, match="'fast'"):
         fflin.sweep(robot, q, engine="fast")
-    monkeypatch.setattr(linearization, "numba_is_there", lambda: False)
+    monkeypatch.setattr(sweep, "numba_is_there", lambda: False)
     assert (fflin.sweep(robot, q, v, u).A == by_python.A).all()
     with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
         fflin.sweep(robot, q, engine="compiled")

@@ -30,7 +30,8 @@ def agreement(robot, q):
     """Largest difference of kernel and loop, over what the conditioning of M lets round-off do."""
     size = 6 + robot.n
     kernel, loop = np.empty((2, len(q), size, size))
-    assert not len(ChunkJob(robot, at_rest=True).write({"q": q}, {"B_lower": kernel}))
+    job = ChunkJob(fflin.Linearizer(robot), at_rest=True)
+    assert not len(job.write({"q": q}, {"B_lower": kernel}))
     inertia = Inertia(fflin.StateMap(robot), robot.create_data())
     for point, inverse in zip(q, loop, strict=True):
         inertia.invert(point, inverse)

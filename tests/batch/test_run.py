@@ -53,7 +53,7 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
     path, told = tmp_path / "walks.h5", []
 
     def run(job):
-        texts = {"kind": "walks", "constant": '["pace"]'}
+        texts = {"kind": "walks"}
         pace = {"pace": np.array([1.5])}
         with (
             closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,

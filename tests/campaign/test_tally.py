@@ -11,7 +11,6 @@ from fflin.campaign.runs import (
     KINDS,
     LOOK,
     CampaignJob,
-    Judge,
     RunStatistics,
     kinds_of,
 )
@@ -193,8 +192,9 @@ def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engi
     starts = np.zeros((10, len(lin.x0)))
     starts[:9, 3:6] = 0.2 * np.eye(3).repeat(3, axis=0) + 0.01 * np.arange(9)[:, None]
     starts[9, 5] = 1e-3
-    judge = Judge(("end", "stop"), lambda runs: {key: runs[key] for key in judge.fields}, halved)
-    job = CampaignJob(robot, policy, None, 0, engine, options, judge)
+    options["histories"] = 1
+    judge = lambda runs: {key: runs[key] for key in ("end", "stop")}  # noqa: E731
+    job = CampaignJob(robot, policy, None, 0, engine, options, judge, halved)
     found = flown(job, starts)
     ends = []
     for start in starts:

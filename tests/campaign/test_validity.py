@@ -22,7 +22,7 @@ from scipy.stats import binomtest
 import fflin
 from fflin.base.intervals import clopper_pearson
 from fflin.batch.run import Execution, OwnWorkers
-from fflin.campaign.settling import OUTCOMES, Loop, settle, settling_runs
+from fflin.campaign.settling import OUTCOMES, Loop, settle
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
 from fflin.simulation.run import go
 from tests.support.campaigns import flown
@@ -77,7 +77,7 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
-    job = settling_runs(loop, False, None, 1.0)
+    job = loop.runs(False, None, 1.0, None)
     plan = job.plan_of(x - lin.x0)
     times = plan.times._replace(dt=0.02, steps=200, every=1)
     run = go(plan.replace(times=times))
@@ -110,7 +110,7 @@ def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, ou
     lin, gain = held(robots["cubesat"])
     loop = Loop(robots["cubesat"], lin, gain.K)
     x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
-    runs_of = partial(settling_runs, loop, False, None, 0.0, "python")
+    runs_of = partial(loop.runs, False, None, 0.0, "python")
     found = settle(runs_of, (x - lin.x0)[None], Execution())
     assert OUTCOMES[int(found["outcome"][0])] == outcome
 
@@ -198,7 +198,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(3), 0.0, 0.4, 0.0)
-    job = settling_runs(loop, False, None, 0.0)
+    job = loop.runs(False, None, 0.0, None)
     times, e = job.plan.times, x - lin.x0
     step, sizes = expm(loop.rate * times.dt), []
     for _ in range(times.steps):

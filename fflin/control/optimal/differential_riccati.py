@@ -171,11 +171,6 @@ def bounded_by(remedy: str) -> Iterator[None]:
         ) from None
 
 
-def spread(B: Array, R: Array) -> Array:
-    """Return B R^-1 B'."""
-    return _symmetric(B @ np.linalg.solve(R, B.mT))
-
-
 def imbalance(terms: Array) -> float:
     """Return the largest norm of a sum of matrices, relative to the norms of the terms.
 

@@ -103,13 +103,10 @@ class Search(NamedTuple):
 
         for iteration in range(_MOST):
             self._report(f"iteration {iteration + 1}", trial, limited)
-            step = self._step(trial, limited, near, cost * trial.u)
+            step = self._step(trial, limited, near, cost * trial.u, left)
             if step is None:
                 return self._flown(trial.u)
-            z, du, y, outside, at_knots = step
-            left.append(at_knots)
-            if _stagnates(left):
-                return self._flown(trial.u)
+            z, du, y, outside = step
             # Powell's rule sets the penalty on gaps from the multipliers.
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
@@ -154,12 +151,14 @@ class Search(NamedTuple):
         return near
 
     def _step(
-        self, trial: Trial, limited: Mask, near: Array, effort: Array
-    ) -> tuple[Array, Array, Array, float, float] | None:
-        """Return the optimal step of the knots and inputs, or None if there is none.
+        self, trial: Trial, limited: Mask, near: Array, effort: Array, left: list[float]
+    ) -> tuple[Array, Array, Array, float] | None:
+        """Return the optimal step of the knots and inputs, or None if none helps.
 
-        The further results are the multipliers, the sum of all remaining violations, and the sum of
-        the violations at the knots.
+        The further results are the multipliers and the sum of all remaining violations. `left`
+        contains the violations at the knots that remained after earlier quadratic programs. The
+        violations of this one are appended; if they are large and did not fall by a tenth in
+        _STAGNANT iterations, the step does not help.
         """
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
@@ -187,13 +186,14 @@ class Search(NamedTuple):
             return None
         z, du, _ = found
         outside = excess(room - rows @ np.hstack((z, du)).ravel()).sum()
-        return *found, float(outside), float(excess(trial.knots - z).sum())
+        left.append(float(excess(trial.knots - z).sum()))
+        before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
+        if min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before):
+            return None
+        return *found, float(outside)
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
-        """Close the gaps between intervals with the smallest changes, if possible.
-
-        `left` contains the violations at the knots that remained after earlier quadratic programs.
-        """
+        """Close the gaps between intervals with the smallest changes, if possible."""
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
@@ -212,9 +212,8 @@ class Search(NamedTuple):
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
-            step = self._step(trial, limited, near, 0.0 * trial.u)
-            left = [*left, np.inf if step is None else step[-1]]
-            if step is None or _stagnates(left):
+            step = self._step(trial, limited, near, 0.0 * trial.u, left)
+            if step is None:
                 break
             u = np.clip(trial.u + step[1], *self.limits)
             trial = self._trial(*shooting.moved(trial.q, trial.v, step[0]), u)
@@ -224,12 +223,6 @@ class Search(NamedTuple):
         """Integrate the motion from the start under the inputs, and return it as a trial."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
-
-
-def _stagnates(left: list[float]) -> bool:
-    """Return whether violations are large and did not fall by a tenth in _STAGNANT iterations."""
-    before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
-    return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
 
 def excess(room: Array) -> Array:

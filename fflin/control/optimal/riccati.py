@@ -201,8 +201,8 @@ def _refined(
         if best.residual <= enough:
             break
         if modes is None:
-            F = equation.A - equation.B @ trial.K
-            modes, fresh = ModalMatrix.of(F, equation.discrete), True
+            poles, V = np.linalg.eig(equation.A - equation.B @ trial.K)
+            modes, fresh = ModalMatrix(V, poles, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(modes.V.conj().T @ trial.defect @ modes.V))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution, a Newton step may improve P although the residual rises, so it is
@@ -238,12 +238,6 @@ class ModalMatrix:
         self.V, self.inverse, self.values = V, np.linalg.inv(V), poles
         across = poles.conj()[:, None]
         self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
-
-    @classmethod
-    def of(cls, F: Array, discrete: bool) -> ModalMatrix:
-        """Compute the modes of a matrix."""
-        poles, V = np.linalg.eig(F)
-        return cls(V, poles, discrete)
 
     def lyapunov(self, r: Values) -> Array:
         """Solve F' D + D F = -s (discrete: F' D F - D = -s) for a symmetric s, from r = V^H s V."""

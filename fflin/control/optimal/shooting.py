@@ -185,6 +185,5 @@ class Shooting:
         u = np.zeros((len(q), len(self._linearizer().u0)))
         wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
         by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
-        for k, rate in enumerate(self.state.velocities(wanted)):
-            u[k] = np.linalg.lstsq(by_u[k], rate, rcond=1e-9)[0]
-        return q, v, u
+        rates = self.state.velocities(wanted)[..., None]
+        return q, v, (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]

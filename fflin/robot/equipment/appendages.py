@@ -215,9 +215,8 @@ class FlexibleAppendage(FrozenArrays):
 
         squares = self.participation.T**2
         rows = [["mode", "f [Hz]", "damping", "m_x", "m_y", "m_z", "I_x", "I_y", "I_z"]]
-        for mode, f, ratio, sizes in zip(
-            self.modes, self.frequency, self.damping, squares, strict=True
-        ):
+        modes = zip(self.modes, self.frequency, self.damping, squares, strict=True)
+        for mode, f, ratio, sizes in modes:
             rows.append([mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)])
         sums, head = squares.sum(axis=0), f"{self.title}: clamped at frame '{self.frame}'"
         totals = {"all modes": sums}

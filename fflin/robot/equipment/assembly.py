@@ -23,7 +23,7 @@ from fflin.base.validation import Array, frozen
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
 from fflin.robot.inputs import Input, ReactionWheel, checked_inputs, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.mass_properties import LinkMass, as_inertia
+from fflin.robot.mass_properties import as_inertia, link_mass
 from fflin.robot.urdf.description import is_impossible
 
 if TYPE_CHECKING:
@@ -146,8 +146,7 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
             )
         taken.add(joint)
         if item.frame in links:
-            at_center = pin.SE3(np.eye(3), of_file.lever)
-            links = {**links, item.frame: LinkMass(of_file.mass, of_file.inertia, at_center)}
+            links = {**links, item.frame: link_mass(of_file)}
         body = body - own + of_file.se3Action(placement)
         bare = replace(bare.with_bodies({joint: body}), links=links)
     items = [

@@ -191,9 +191,7 @@ def read_joint(name: str, element: Element) -> JointElement:
 def _limits(found: Element) -> dict[str, float]:
     """Return the valid limits; an invalid one causes only a note, because A and B ignore limits."""
     limits: dict[str, float] = {}
-    for name in ("lower", "upper", "effort", "velocity"):
-        if name not in found.attributes:
-            continue
+    for name in (x for x in ("lower", "upper", "effort", "velocity") if x in found.attributes):
         value = decimal(found.attributes[name].strip())
         if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
             found.note(

@@ -85,9 +85,7 @@ class Element:
                 "keep one of them"
             )
         for child in found if attributes else ():
-            for name in child.attributes:
-                if name in attributes or ":" in name:
-                    continue
+            for name in (x for x in child.attributes if x not in attributes and ":" not in x):
                 if nearest(name.lower(), attributes, _NEAR):
                     raise child.error(
                         f"{child.title} has an unknown attribute {quoted(name)}; known: "
