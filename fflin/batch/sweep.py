@@ -382,7 +382,7 @@ class SweepTask:
             {
                 "robot": repr(settings),
                 "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
-                "reference": prepared.common["placement"],
+                "reference": pin.SE3ToXYZQUAT(prepared.map.reference),
                 **self._known,
                 **{f"of q: {key}": value for key, value in points.items()},
             }

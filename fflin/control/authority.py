@@ -23,8 +23,6 @@ _ROUNDING = 1e-9
 
 _AXES = "xyz"
 
-_ORIGIN = np.eye(7)[6]  # position and quaternion of the base
-
 
 class WheelMomentum(NamedTuple):
     """Total momentum of a robot's wheels in base axes, and the momentum that they can store."""
@@ -108,7 +106,7 @@ class PointProperties(NamedTuple):
 def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
     """Return the mass properties, the wheel momentum and the thruster authority at q and v."""
     # With the base at the origin, world axes are base axes.
-    data, q = robot.create_data(), np.concatenate((_ORIGIN, q[7:]))
+    data, q = robot.create_data(), np.concatenate((robot.neutral()[:7], q[7:]))
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center, inertia = data.com[0].copy(), np.array(data.Ig.inertia)
     of_equipment = wheel_momentum(robot, data, v), thruster_authority(robot, q, center)

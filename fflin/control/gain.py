@@ -155,15 +155,9 @@ class Gain(ModelDesign):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        return "\n\n".join(
-            (
-                f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}",
-                f"K ({nu} x {nx}){shown}",
-                _poles(self),
-                fold(figures),
-                *(fold(f"{what}: {said}") for what, said in more.items() if said),
-            )
-        )
+        head = f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}"
+        notes = [fold(f"{what}: {said}") for what, said in more.items() if said]
+        return "\n\n".join((head, f"K ({nu} x {nx}){shown}", _poles(self), fold(figures), *notes))
 
     @property
     def closed_loop(self) -> Array:
@@ -294,14 +288,11 @@ def _poles(gain: Gain) -> str:
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
     heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
-    rows = Counter(
-        (
-            f"{poles[k].real:.5g}" + (f" +- {poles[k].imag:.5g}i" if poles[k].imag else ""),
-            f"{abs(rates[k]):.4g}",
-            f"{-rates[k].real / abs(rates[k]):.4g}",
-        )
-        for k in np.argsort(-rates.real)
-    )
+    rows = Counter[tuple[str, ...]]()
+    for k in np.argsort(-rates.real):
+        pole, rate = poles[k], rates[k]
+        shown = f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
+        rows[shown, f"{abs(rate):.4g}", f"{-rate.real / abs(rate):.4g}"] += 1
     table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
     if max(rows.values()) == 1:
         table = [row[:-1] for row in table]

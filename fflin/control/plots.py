@@ -61,10 +61,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
-        drawn = [
-            np.ma.masked_where((m == 0.0) | (np.abs(m) < rounding(m)), np.abs(m))
-            for m in (lin.A, lin.B)
-        ]
+        drawn = [np.ma.masked_where(np.abs(m) <= rounding(m), np.abs(m)) for m in (lin.A, lin.B)]
         entries = np.concatenate([m.compressed() for m in drawn])
         top = float(entries.max(initial=0.0)) or 1.0
         norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
@@ -133,20 +130,15 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
             growth = "grows" if mode.unstable else "decays"
             label = f"real, {growth} in {mode.time_constant:.3g} s"
             if mode.oscillates:
-                label = (
-                    f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
-                    f"damping {mode.damping_ratio:.2g}"
-                )
+                rate, hertz = mode.frequency, mode.frequency / (2.0 * np.pi)
+                label = f"{rate:.3g} rad/s, {hertz:.3g} Hz, damping {mode.damping_ratio:.2g}"
             labels.append(label)
         axes.set_xticks(range(half), names, rotation=90, fontsize=8)
         axes.set_yticks(range(count), labels, fontsize=8)
         axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
-        figure.legend(
-            handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
-            title="largest entry: 1; outline: modulus of an entry out of phase",
-            loc="outside lower center",
-            ncols=len(colors),
-        )
+        patches = [Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()]
+        said = "largest entry: 1; outline: modulus of an entry out of phase"
+        figure.legend(handles=patches, title=said, loc="outside lower center", ncols=len(colors))
         figure.suptitle(title)
     return figure
 
@@ -274,13 +266,9 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
             f"{name}: {min(loop.phase, 180.0):.0f} deg, {loop.gain[0]:.2g} to {loop.gain[1]:.3g}"
             for name, loop in zip(gain.input_names, loops, strict=True)
         )
-        figure.legend(
-            sizes.get_lines()[: len(loops)],
-            names,
-            title="margins at each input: phase, gain factors",
-            loc="outside right upper",
-            fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
-        )
+        lines, said = sizes.get_lines()[: len(loops)], "margins at each input: phase, gain factors"
+        letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
+        figure.legend(lines, names, title=said, loc="outside right upper", fontsize=letters)
         # Discrete-time poles z lie close together near 1, so their rates ln(z)/dt are drawn.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
@@ -360,13 +348,8 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
 
 def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
     for index, (label, values) in enumerate(sets.items()):
-        axes.plot(
-            values.real,
-            values.imag,
-            "x" if index == 0 else "+",
-            color=COLORS[index % len(COLORS)],
-            label=label or None,
-        )
+        color, marker = COLORS[index % len(COLORS)], "+" if index else "x"
+        axes.plot(values.real, values.imag, marker, color=color, label=label or None)
     if dt:
         angle = np.linspace(0.0, 2.0 * np.pi, 201)
         axes.plot(np.cos(angle), np.sin(angle), color=_LINE, lw=0.8)

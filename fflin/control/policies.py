@@ -169,10 +169,9 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        self._design, self._robot = (
-            Actuation(StateMap(each, reference=reference, frame=frame))
-            for each in (allocation.design, robot)
-        )
+        design = StateMap(allocation.design, reference=reference, frame=frame)
+        self._design = Actuation(design)
+        self._robot = Actuation(StateMap(robot, reference=reference, frame=frame))
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)

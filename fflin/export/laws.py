@@ -28,6 +28,7 @@ from fflin.robot.robot import Robot
 CASES = 200
 
 OfStates: TypeAlias = Gain | StateFeedback | Gridded | GainSchedule | TrajectoryFeedback
+OfOutputs: TypeAlias = LinearController | Compensator
 
 
 class Case(NamedTuple):
@@ -76,9 +77,7 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
 def law_of(given: object, robot: object, limits: object) -> Law:
     """Convert a policy or design to the tables of a law, with `limits` as in `simulate`."""
-    if isinstance(given, TrajectoryOutputFeedback) or not isinstance(
-        given, OfStates | LinearController | Compensator
-    ):
+    if isinstance(given, TrajectoryOutputFeedback) or not isinstance(given, OfStates | OfOutputs):
         raise InputError(
             f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
             "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
@@ -95,10 +94,7 @@ def law_of(given: object, robot: object, limits: object) -> Law:
             "its continuous joints; give the robot with robot= (--robot)"
         )
     robot = instance("robot", robot, Robot, "a Robot")
-    if isinstance(given, LinearController | Compensator):
-        law = _output_law(given, robot)
-    else:
-        law = _state_law(given, robot)
+    law = _output_law(given, robot) if isinstance(given, OfOutputs) else _state_law(given, robot)
     names, _ = law.inputs
     high = np.full(len(names), np.inf)
     low = -high
@@ -233,7 +229,7 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     }
 
 
-def _output_law(given: LinearController | Compensator, robot: Robot) -> Law:
+def _output_law(given: OfOutputs, robot: Robot) -> Law:
     lin = None
     if isinstance(given, LinearController):
         terms, lin = given.terms(), given.lin

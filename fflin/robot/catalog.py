@@ -11,9 +11,6 @@ from fflin.base.errors import FileError, InputError, require_known, unknown
 from fflin.base.validation import instance
 from fflin.base.writing import as_path, missing, shown
 
-# Robots that example-robot-data builds in code from another robot, so they have no URDF.
-_MADE_BY_CODE = ("talos_legs",)
-
 
 class RobotFile(NamedTuple):
     """Location of a robot's description."""
@@ -45,7 +42,8 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
     found = {}
     for name, loader in ROBOTS.items():
-        if loader.urdf_filename and name not in _MADE_BY_CODE:
+        # The package builds talos_legs in code from another robot, so it has no URDF.
+        if loader.urdf_filename and name != "talos_legs":
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
             folders = (root.parents[1], root.parent)

@@ -20,8 +20,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name, matching
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, number, positive, shaped, vector, whole
-from fflin.base.validation import by_name as mapping
+from fflin.base.validation import Array, instance, number, positive, shaped, vector, whole
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
 
@@ -51,7 +50,7 @@ def dynamic_parameters(model: pin.Model) -> bytes:
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint index: inertia} from the argument of `Robot.with_mass_properties`."""
-    given = mapping("bodies", bodies, "body")
+    given = instance("bodies", bodies, Mapping, "{body: value}")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     first_link, links = len(index_of), dict[int, list[str]]()
     for frame in model.frames.tolist():

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_continuous_are, solve_discrete_are
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array, Values
@@ -108,8 +109,6 @@ def solve(
     Raise `LinAlgError` if both fail. Newton's method refines the solution (D. L. Kleinman, IEEE
     Trans. Automatic Control 13(1), 1968).
     """
-    from scipy.linalg import solve_continuous_are, solve_discrete_are
-
     equation = Riccati(A, B, Q, R, N, dt)
     found = _half_size(equation)
     if found is not None and found.residual <= _SOUND:
