@@ -13,7 +13,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5, sect
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
-from fflin.kernel.vectors import load, splat, store
+from fflin.kernel.vectors import load, store
 
 # Offsets of the motion vectors of each body: velocity, Psi', acceleration if c = 0, acceleration
 # that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
@@ -50,7 +50,6 @@ def spatial_inertia_times(work, at, motion):
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies, from the base outwards."""
     places, own = tree.places, tree.own
-    one, zero = splat(work, 1.0), splat(work, 0.0)
     vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
     _inertia(work, own, places, tree.bodies, 0)
@@ -62,7 +61,7 @@ def outwards(work, tree, q):
         elif tree.turns[body] != 0.0:
             cosine, sine = vec.cosine_and_sine(tree.turns[body] * value)
         else:
-            cosine, sine = one, zero
+            cosine, sine = 1.0, 0.0
         first = body * PLACE
         axes = vec.get_columns(work, places + tree.parent[body] * PLACE)
         x = vec.product(axes, vec.get3(tree.fixed, first))
@@ -80,11 +79,8 @@ def inwards(work, tree):
     """Write the packed M, its diagonal and the composite inertias, from the tips inwards."""
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
-    zero = splat(work, 0.0)
-    for index in range(len(tree.path)):
-        store(work, packed + index, 0.0)
-    for index in range(bodies * INERTIA):
-        store(work, inertias + index, load(work, tree.own + index))
+    vec.clear(work, packed, len(tree.path))
+    vec.copy(work, tree.own, work, inertias, bodies * INERTIA)
     pair = 0
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA
@@ -122,9 +118,9 @@ def inwards(work, tree):
     hx, hy, hz = vec.get3(work, inertias + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, inertias + 4)
     vec.put6(work, packed, ((xx, xy, yy), (xz, yz, zz)))
-    vec.put6(work, packed + 6, ((zero, hz, -hy), (m, -hz, zero)))
-    vec.put3(work, packed + 12, (hx, zero, m))
-    vec.put6(work, packed + 15, ((hy, -hx, zero), (zero, zero, m)))
+    vec.put6(work, packed + 6, ((0.0, hz, -hy), (m, -hz, 0.0)))
+    vec.put3(work, packed + 12, (hx, 0.0, m))
+    vec.put6(work, packed + 15, ((hy, -hx, 0.0), (0.0, 0.0, m)))
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index])
         vec.add(work, at, tree.armature[index])
@@ -172,11 +168,10 @@ def solve(work, tree, x):
 def invert_factor(work, tree):
     """Replace L by U = L^-1, and write V = L^-1 D^-1."""
     packed, scaled = tree.packed, tree.scaled
-    zero = splat(work, 0.0)
     for k in range(len(tree.row)):
         row, depth = packed + tree.row[k], tree.depth[k]
         for t in range(depth):
-            total = zero - load(work, row + t)
+            total = -load(work, row + t)
             for s in range(t + 1, depth):
                 other = packed + tree.row[tree.path[tree.row[k] + s]]
                 total = total - load(work, row + s) * load(work, other + t)
@@ -189,8 +184,7 @@ def invert_factor(work, tree):
 def multiply(work, tree, judged):
     """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
-    size = len(tree.row)
-    coupling = splat(work, 0.0)
+    size, coupling = len(tree.row), 0.0
     for i in range(size):
         left = packed + tree.row[i]
         for j in range(i + 1):
@@ -231,8 +225,7 @@ def at_parent(work, place, force):
 
 def move_bodies(work, tree, nu):
     """Write velocities, and accelerations if c = 0, from the base outwards, for v_b = 0."""
-    for entry in range(MOTION):
-        store(work, tree.motion + entry, 0.0)
+    vec.clear(work, tree.motion, MOTION)
     vec.put3(work, tree.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):
         at = tree.motion + body * MOTION
@@ -274,7 +267,6 @@ def load_carried(work, tree, u):
 
 def collect_momenta(work, tree):
     """Write the momentum, the moments G and the stored momentum of each subtree."""
-    zero = splat(work, 0.0)
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD
         own = tree.own + body * INERTIA
@@ -288,8 +280,8 @@ def collect_momenta(work, tree):
         for axis in range(3):
             column = vec.plus(vec.times(v, h[axis]), vec.cross(w, second[axis]))
             vec.put3(work, at + MOMENTS + 3 * axis, column)
-        vec.put3(work, at + STORED, (zero, zero, zero))
-        vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
+        vec.clear(work, at + STORED, 3)
+        vec.clear(work, at + CARRIED, 6)
     for index in range(len(tree.stored_body)):
         at = tree.load + tree.stored_body[index] * LOAD + STORED
         vec.add3(work, at, stored_momentum(work, tree, index))
@@ -329,8 +321,7 @@ def add_column(work, at, width, force):
 def write_columns(work, tree):
     """Write the generalised force per unit of each body-fixed input."""
     count = len(tree.wrench_body)
-    for entry in range(len(tree.row) * count):
-        store(work, tree.columns + entry, 0.0)
+    vec.clear(work, tree.columns, len(tree.row) * count)
     for index in range(count):
         body, wrench = tree.wrench_body[index], carried_wrench(work, tree, index)
         while body > 0:
@@ -343,8 +334,7 @@ def write_columns(work, tree):
 
 def collect(work, tree):
     """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
-    for index in range(len(tree.row)):
-        store(work, tree.bias + index, 0.0)
+    vec.clear(work, tree.bias, len(tree.row))
     for body in range(len(tree.parent) - 1, 0, -1):
         force = vec.get6(work, tree.load + body * LOAD + FORCE)
         value = vec.dot6(joint_axis(work, tree, body), force)

@@ -35,7 +35,7 @@ from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
-from fflin.kernel.vectors import load, splat, store
+from fflin.kernel.vectors import load, store
 
 
 def _coriolis(work, at, w):
@@ -62,8 +62,7 @@ def differentiate(work, tree):
     """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
-    for entry in range(len(tree.row) * width):
-        store(work, tree.lower + entry, 0.0)
+    vec.clear(work, tree.lower, len(tree.row) * width)
     for index in range(n):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
@@ -124,7 +123,7 @@ def _push(work, tree, by_u):
                 value = load(work, tree.square + row * size + tree.driven[index])
                 store(work, by_u + row * count + index, value)
         for index in range(carried):
-            total = splat(work, 0.0)
+            total = 0.0
             for k in range(size):
                 column = load(work, tree.columns + k * carried + index)
                 total = total + load(work, tree.square + row * size + k) * column
@@ -133,12 +132,11 @@ def _push(work, tree, by_u):
 
 def _solve(work, tree, slopes):
     """Write -M^-1 times the derivatives of the forces, six columns at a time."""
-    size = len(tree.row)
-    width, zero = 2 * size, splat(work, 0.0)
-    none = (zero, zero, zero), (zero, zero, zero)
+    size, width = len(tree.row), 2 * len(tree.row)
+    none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     # The first six columns, over the base's rotation and translation, are zero.
     for row in range(size):
-        vec.put6(work, slopes + row * width, none)
+        vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
         for k in range(size):
             vec.put6(work, tree.held + k * 6, vec.get6(work, tree.lower + column + k * width))

@@ -108,8 +108,7 @@ def push(work, tree, pushing):
     written the columns of body-fixed inputs.
     """
     size, count = len(tree.row), len(tree.wrench_body)
-    for index in range(size):
-        store(work, tree.c + index, 0.0)
+    vec.clear(work, tree.c, size)
     for index in range(len(tree.driven)):
         if tree.driven[index] >= 0:
             vec.add(work, tree.c + tree.driven[index], load(pushing, index))
@@ -196,8 +195,7 @@ def end_step(reference, h):
     shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
     vec.add3(reference.sums, SHIFT, vec.times(shift, per_mass))
     vec.add6(reference.sums, IMPULSE, vec.get6(reference.sums, STEP_IMPULSE))
-    for entry in range(STEP_IMPULSE, SUMS):
-        store(reference.sums, entry, 0.0)
+    vec.clear(reference.sums, STEP_IMPULSE, SUMS - STEP_IMPULSE)
 
 
 def kept_at(reference, t):

@@ -332,8 +332,7 @@ def _compare(stats, step):
         read_state(stats.robot, stats.law, at, 0)
         for index in range(len(e)):
             store(e, index, load(stats.law.x, index) - load(stats.x_ref, index))
-    for kind in range(len(sizes)):
-        store(sizes, kind, 0.0)
+    vec.clear(sizes, 0, len(sizes))
     for index in range(len(e)):
         value, kind = _size(load(e, index)), stats.kind[index]
         if kind >= 0:

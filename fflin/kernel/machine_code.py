@@ -22,7 +22,6 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from functools import cache, partial, wraps
-from itertools import product
 from types import FunctionType, ModuleType
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -35,6 +34,7 @@ from numba.core.base import BaseContext
 from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import _CompileStats
+from numba.core.typeconv import Conversion
 from numba.core.typing import BaseContext as TypingContext
 from numba.core.typing import Signature, make_concrete_template
 from numba.core.typing.templates import AttributeTemplate, infer_global
@@ -55,7 +55,11 @@ Typer: TypeAlias = Callable[..., Signature]
 
 
 class Lanes(Type):
-    """numba type of eight doubles in one vector."""
+    """numba type of eight doubles in one vector; a double can stand for eight equal numbers."""
+
+    def can_convert_from(self, _: TypingContext, other: Type) -> Conversion | None:
+        """Return that doubles convert to lanes."""
+        return Conversion.promote if other == float64 else None
 
 
 lanes = Lanes("Lanes")
@@ -64,39 +68,33 @@ lanes = Lanes("Lanes")
 extending.register_model(Lanes)(partial(extending.models.PrimitiveModel, be_type=_VECTOR))
 
 
-def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """Copy a double to all lanes; return lanes unchanged."""
-    if value.type == _VECTOR:
-        return value
+@extending.lower_cast(float64, lanes)
+def _spread(
+    _: BaseContext, builder: ir.IRBuilder, __: Type, ___: Type, value: ir.Value
+) -> ir.Value:
+    """Copy a double to all lanes."""
     nothing = ir.Constant(_VECTOR, ir.Undefined)
     one = builder.insert_element(nothing, value, _INT32(0))
     return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None))
 
 
-def _alike(builder: ir.IRBuilder, *values: ir.Value) -> Sequence[ir.Value]:
-    """Convert all values to lanes if one of them has lanes."""
-    if any(value.type == _VECTOR for value in values):
-        return [_spread(builder, value) for value in values]
-    return values
-
-
-def _together(*kinds: Type) -> Signature:
-    """Return the signature of an operation whose result has lanes if an operand has lanes."""
-    return (lanes if lanes in kinds else float64)(*kinds)
+def _alike(*kinds: Type) -> Signature:
+    """Return the signature of an operation of lanes if an operand has lanes, else of doubles."""
+    kind = lanes if lanes in kinds else float64
+    return kind(*[kind] * len(kinds))
 
 
 def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
-    """Define an operator of Python for lanes, and for lanes combined with doubles."""
+    """Define an operator of Python for lanes."""
 
     def lowered(
         _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
     ) -> ir.Value:
-        return generate(builder, *_alike(builder, *values), flags=["contract"])
+        return generate(builder, *values, flags=["contract"])
 
-    signatures = [lanes(*k) for k in product((lanes, float64), repeat=operands) if lanes in k]
-    infer_global(python)(make_concrete_template(python.__name__, python, signatures))
-    for signature in signatures:
-        extending.lower_builtin(python, *signature.args)(lowered)
+    signature = lanes(*[lanes] * operands)
+    infer_global(python)(make_concrete_template(python.__name__, python, [signature]))
+    extending.lower_builtin(python, *signature.args)(lowered)
 
 
 _arithmetic(operator.add, ir.IRBuilder.fadd)
@@ -153,20 +151,9 @@ def _load(builder: ir.IRBuilder, array: ir.Value, index: ir.Value) -> ir.Value:
     return value
 
 
-def _type_store(array: Array, index: Type, value: Type) -> Signature:
-    return void(array, intp, value if _held(array) == value == lanes else float64)
-
-
-@_operation(uncompiled.store, _type_store)
+@_operation(uncompiled.store, lambda array, index, _: void(array, intp, _held(array)))
 def _store(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, value: ir.Value) -> None:
-    place = builder.gep(array, [index])
-    written = _spread(builder, value) if place.type.pointee == _VECTOR else value
-    builder.store(written, place).align = _BYTES
-
-
-@_operation(uncompiled.splat, lambda array, value: _held(array)(array, float64))
-def _splat(builder: ir.IRBuilder, array: ir.Value, value: ir.Value) -> ir.Value:
-    return _spread(builder, value) if array.type.pointee == _VECTOR else value
+    builder.store(value, builder.gep(array, [index])).align = _BYTES
 
 
 def _rounding(replaced: Callable[..., object], name: str) -> None:
@@ -185,17 +172,15 @@ _rounding(uncompiled.whole, "rint")
 _rounding(uncompiled.root, "sqrt")
 
 
-@_operation(uncompiled.chosen, _together)
+@_operation(uncompiled.chosen, _alike)
 def _chosen(
     builder: ir.IRBuilder, left: ir.Value, right: ir.Value, less: ir.Value, other: ir.Value
 ) -> ir.Value:
-    left, right, less, other = _alike(builder, left, right, less, other)
     return builder.select(builder.fcmp_ordered("<", left, right), less, other)
 
 
-@_operation(uncompiled.below, boolean)
+@_operation(uncompiled.below, lambda *kinds: boolean(*_alike(*kinds).args))
 def _below(builder: ir.IRBuilder, value: ir.Value, bound: ir.Value) -> ir.Value:
-    value, bound = _alike(builder, value, bound)
     less = builder.fcmp_ordered("<", value, bound)
     if value.type != _VECTOR:
         return less
@@ -203,16 +188,16 @@ def _below(builder: ir.IRBuilder, value: ir.Value, bound: ir.Value) -> ir.Value:
     return builder.icmp_signed("==", builder.bitcast(less, bits), ir.Constant(bits, -1))
 
 
-@_operation(uncompiled.angle, _together)
+@_operation(uncompiled.angle, _alike)
 def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
     kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
     atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")
-    pair = _alike(builder, sine, cosine)
-    if pair[0].type == _DOUBLE:
-        return builder.call(atan2, pair)
+    if sine.type == _DOUBLE:
+        return builder.call(atan2, [sine, cosine])
     result = ir.Constant(_VECTOR, ir.Undefined)
     for lane in map(_INT32, range(LANES)):
-        one = builder.call(atan2, [builder.extract_element(each, lane) for each in pair])
+        pair = builder.extract_element(sine, lane), builder.extract_element(cosine, lane)
+        one = builder.call(atan2, pair)
         result = builder.insert_element(result, one, lane)
     return result
 

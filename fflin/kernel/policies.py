@@ -12,7 +12,7 @@ from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import angle, called, chosen, load, splat, store, whole
+from fflin.kernel.vectors import angle, called, chosen, load, store, whole
 
 _NEAR = 1e-9  # a time counts as a knot if it is nearer than this fraction of the interval
 
@@ -117,7 +117,7 @@ def track(robot, path, point, u, t):
     k = len(starts) if after else k
     first, size = k * path.order * count * width, count * width
     for row in range(count):
-        total = splat(u, there.u[row])
+        total = there.u[row]
         for column in range(width):
             at, gain = first + row * width + column, 0.0
             for power in range(path.order - 1, -1, -1):
@@ -203,7 +203,7 @@ def read_state(robot, law, point, row):
 
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
-    total, width = splat(x, 0.0), len(x)
+    total, width = 0.0, len(x)
     for index in range(width):
         total = total + load(matrix, row * width + index) * load(x, index)
     return total
@@ -240,8 +240,7 @@ def _feed_back_between(robot, law, point):
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
         store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
-    for index in range(inputs):
-        store(u, index, 0.0)
+    vec.clear(u, 0, inputs)
     for lane in range(vec.lane_count(u)):
         for corner in range(1 << len(grid.joint)):
             weight, cell = _corner(grid, corner, lane)

@@ -64,11 +64,6 @@ def store(array: Entries, index: int, value: Number) -> None:
     array[index] = value
 
 
-def splat(array: Entries, value: float) -> Number:
-    """Convert a number to the entry type of an array: one number, or the number in all lanes."""
-    return value
-
-
 def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
     """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
     return less if left < right else other
@@ -114,6 +109,12 @@ def copy(source, first, target, to, count):
     """Copy `count` entries."""
     for index in range(count):
         store(target, to + index, load(source, first + index))
+
+
+def clear(target, to, count):
+    """Set `count` entries to zero."""
+    for index in range(count):
+        store(target, to + index, 0.0)
 
 
 def add(work, at, value):

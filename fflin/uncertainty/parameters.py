@@ -21,11 +21,8 @@ AXES = "xyz"
 # (row, column) of the six entries of an inertia.
 ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
 # Parameters of a link or body.
-OF_PIECES = {
-    *("mass", "density"),
-    *(f"com.{axis}" for axis in AXES),
-    *(f"inertia.{entry}" for entry in ENTRIES),
-}
+OF_PIECES = {"mass", "density", *(f"com.{axis}" for axis in AXES)}
+OF_PIECES |= {f"inertia.{entry}" for entry in ENTRIES}
 _ROUNDING = 1e-9
 _TURN = 2.0 * math.pi  # [rad]
 
