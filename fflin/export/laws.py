@@ -180,8 +180,9 @@ def _state_cases(
             turn = np.array((1.0, 0.0, 0.0, 0.0))
         turn = quaternion_product(about[3:], turn / norm(turn))
         q[3:7] = quaternion_product(conjugate(world.origin_quaternion), turn)
-        there = about[:3] + random.normal(size=3)
-        q[:3] = world.origin.rotation.T @ (there - world.origin.translation)
+        q[:3] = world.origin.rotation.T @ (
+            about[:3] + random.normal(size=3) - world.origin.translation
+        )
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
@@ -278,5 +279,4 @@ def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
         of_z, of_y = np.abs(z), np.abs(y) + np.abs(by.y0) + np.abs(turns)
         scale = np.abs(by.u0) + np.abs(by.C) @ of_z + np.abs(by.D) @ of_y
         after = np.abs(by.A) @ of_z + np.abs(by.B) @ of_y
-        out, scales = np.append(u, next_z), np.append(scale, after)
-        yield Case(0, np.append(z, y + turns), out, scales)
+        yield Case(0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after))
