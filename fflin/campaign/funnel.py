@@ -360,7 +360,7 @@ def funnel(
     motion, by = feedback.trajectory, feedback.schedule
     reached = partial(_outcomes, final, limits, by.P[-1])
     indices = _indices(motion, by, knots)
-    jobs = [runs_from(robot, feedback, *pair, engine, options, reached) for pair in indices]
+    jobs = [runs_from(robot, feedback, pair, engine, options, reached) for pair in indices]
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
     with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
@@ -442,14 +442,13 @@ def _tested(
 def runs_from(
     robot: Robot,
     feedback: TrajectoryFeedback,
-    k: int,
-    first: int,
+    knot: tuple[int, int],
     engine: str | None,
     options: Mapping[str, object],
     judge: Judge = of_campaign,
 ) -> CampaignJob:
-    """Return a job for runs that start at knot k of the trajectory (`first` of the schedule)."""
-    motion, schedule = feedback.trajectory, feedback.schedule
+    """Return a job for runs that start at a knot; `knot` has its indices as in `_indices`."""
+    motion, schedule, (k, first) = feedback.trajectory, feedback.schedule, knot
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
     policy = replace(
@@ -494,8 +493,7 @@ def _indices(
         count = validation.whole("knots", knots, 1)
         chosen = both[np.linspace(0, len(both) - 1, count).round().astype(int)]
     else:
-        times = validation.as_double("knots", knots).ravel()
-        times = validation.vector("knots", times, times.size, "times of knots")
+        times = validation.vector("knots", knots, np.size(knots), "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
         raise InputError("knots is empty; give the number of knots, or a list of times [s]")

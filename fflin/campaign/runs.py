@@ -6,7 +6,6 @@ of the statistics does not depend on the duration of the run.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -165,7 +164,7 @@ class CampaignJob:
     def __reduce__(self) -> tuple[object, ...]:
         # A worker constructs the job again, because functions that are bound to a robot cannot be
         # pickled.
-        return _remade, (self._again, self.engine)
+        return partial(self._again, engine=self.engine), ()
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
         """Return the drawn values of runs start to stop - 1; see `RowsOf`."""
@@ -202,11 +201,9 @@ class CampaignJob:
             runs = self.dispersions.in_lanes(drawn)
             eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
             for first in range(0, len(drawn), LANES):
-                eight, their_out = (
-                    {key: each[first : first + LANES] for key, each in arrays.items()}
-                    for arrays in (runs, found)
-                )
-                eight_runs.fly(statistics, their_out, eight)
+                part = slice(first, first + LANES)
+                eight = {key: each[part] for key, each in runs.items()}
+                eight_runs.fly(statistics, {key: x[part] for key, x in found.items()}, eight)
         else:
             for row, own in enumerate(drawn):
                 outcome = self._one(own)
@@ -219,10 +216,9 @@ class CampaignJob:
     def errors(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the states (N, nx) for q and v at the first N steps, and the state errors."""
         state, target = self.plant.state, self.target
-        moving = target.ndim == 2
-        x = states_of(state, q, state.velocities(v))
-        x = unwound(state, x, target[0] if moving else target)
-        if not moving:
+        first = target if target.ndim == 1 else target[0]
+        x = unwound(state, states_of(state, q, state.velocities(v)), first)
+        if target.ndim == 1:
             return x, x - target
         return x, unwound(state, moving_errors(state.frame, x, target[: len(x)]))
 
@@ -421,13 +417,6 @@ def expect(
     except FflinError:
         return  # the run itself reports this error
     tell(seconds / cores, cores)
-
-
-def _remade(again: Callable[..., CampaignJob], engine: str) -> CampaignJob:
-    """Create a job in a worker, without repeating its warnings."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return again(engine=engine)
 
 
 def chunk_size(count: int, workers: int, least: int = LANES) -> int:

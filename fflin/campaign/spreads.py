@@ -205,9 +205,6 @@ def _normal(deviation: float, u: Array) -> Array:
     return normal
 
 
-def _whole(end: float, u: Array) -> Array:
-    return np.floor(end * u)
-
-
-# Inverse distribution of the noise seeds: whole numbers below 2^53, which are exact as doubles.
-SEEDS = partial(_whole, 2.0**53)
+# Inverse distribution of the noise seeds: whole numbers below 2^53, because the uniform values of
+# NumPy are multiples of 2^-53.
+SEEDS: Inverse = partial(np.multiply, 2.0**53)

@@ -7,12 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from fflin.base.errors import FileError, InputError, require_known, unknown
+from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.validation import instance
 from fflin.base.writing import as_path, missing, shown
-
-# Robots that example-robot-data builds in code from another robot, so they have no URDF.
-_MADE_BY_CODE = ("talos_legs",)
 
 
 class RobotFile(NamedTuple):
@@ -45,7 +42,8 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
     found = {}
     for name, loader in ROBOTS.items():
-        if loader.urdf_filename and name not in _MADE_BY_CODE:
+        # The package builds talos_legs in code from another robot, so it has no URDF.
+        if loader.urdf_filename and name != "talos_legs":
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
             folders = (root.parents[1], root.parent)
@@ -93,13 +91,11 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by its bundled name, or otherwise by its path."""
-    path = as_path(inputs)
-    bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
-    if str(inputs) in bundled:
-        return bundled[str(inputs)]
-    if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
-        raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
-    return path
+    path, name = as_path(inputs), str(inputs)
+    bundled = {each.stem: each for each in sorted(bundled_directory().glob("*.toml"))}
+    if path.name == name and not path.suffix and not os.path.lexists(path):
+        require_known("file or bundled set of inputs", [name], bundled)
+    return bundled.get(name, path)
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:

@@ -20,9 +20,8 @@ import pinocchio as pin
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name, matching
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, number, positive, shaped, vector, whole
-from fflin.base.validation import by_name as mapping
-from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.base.validation import Array, instance, number, positive, shaped, vector, whole
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def dynamic_parameters(model: pin.Model) -> bytes:
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
     """Return {joint index: inertia} from the argument of `Robot.with_mass_properties`."""
-    given = mapping("bodies", bodies, "body")
+    given = instance("bodies", bodies, Mapping, "{body: value}")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     first_link, links = len(index_of), dict[int, list[str]]()
     for frame in model.frames.tolist():
@@ -326,11 +325,11 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
     busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
     if named:
         busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
-    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
-    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
+    free = {name: index for name, index in index_of.items() if index not in busy}
+    return tuple(name for name, index in free.items() if _is_symmetric(robot, index))
 
 
-def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
+def _is_symmetric(robot: Robot, index: int) -> bool:
     """Return whether the body of a joint is symmetric about the joint axis."""
     pin_joint = robot.model.joints[index]
     data = pin_joint.createData()

@@ -352,8 +352,7 @@ class Robot(Coordinates):
     @cached_property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
-        pieces = self.pieces
-        return {each.body: name for name, each in pieces.items() if each.body not in pieces}
+        return {x.body: name for name, x in self.pieces.items() if x.body not in self.pieces}
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -395,9 +394,8 @@ class Robot(Coordinates):
         InputError
             If the name belongs to a mimic joint, a wheel without inertia or a locked joint.
         """
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
+        if found := next((joint for joint in self.joints if joint.name == name), None):
+            return found
         leader = {each.joint.name: each.leader.name for each in self.followers}.get(name)
         if leader:
             raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")

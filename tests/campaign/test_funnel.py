@@ -166,7 +166,7 @@ def test_a_run_from_a_knot_is_one_of_simulate(arm):
     robot, schedule = arm
     motion = schedule.trajectory(robot)
     policy = fflin.TrajectoryFeedback(motion, schedule)
-    campaign = runs_from(robot, policy, 5, 10, "python", {"dt": 0.05})
+    campaign = runs_from(robot, policy, (5, 10), "python", {"dt": 0.05})
     e = 0.01 * np.random.default_rng(0).normal(size=campaign.x0.size)
     x = moved_by("local", campaign.x0[None], e[None])[0]
     end = campaign.replay(x - campaign.x0)

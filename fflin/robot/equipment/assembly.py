@@ -75,17 +75,16 @@ def equipped(
     items = robot.appendages if appendages is None else tuple(appendages)
     parts += _mounted_modes(model, bodies, items)
     if parts:
-        new = [part.joint for part in parts]
-        taken = [*{*model.names, *(frame.name for frame in model.frames.tolist())}]
-        taken += [joint.name for joint in new]
-        for name in taken[-len(new) :]:
-            if taken.count(name) > 1:
+        taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
+        for part in parts:
+            if part.joint.name in taken:
                 raise InputError(
-                    f"'{name}' has the name of another joint, frame, wheel or mode of the robot; "
-                    "give the wheel or the appendage another name"
+                    f"'{part.joint.name}' has the name of another joint, frame, wheel or mode of "
+                    "the robot; give the wheel or the appendage another name"
                 )
+            taken.add(part.joint.name)
         model = _with_mounted(model, bodies, parts)
-        placed = [joint.within(model) for joint in (*joints, *new)]
+        placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(each.within(model) for each in followers)
     names = [joint.name for joint in joints]
