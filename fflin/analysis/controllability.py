@@ -169,7 +169,7 @@ def controllability(lin: LinearModel) -> Controllability:
         z, R = conserved.selected, conserved.rates
         X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
         inside, _, rows, fixed = split_by_poles(X, lin.B[z], M, lin.dt)
-        found = inside, rows, None, "eigenvalues", fixed.transformed(R)
+        found = inside, rows, None, "eigenvalues", fixed
     controllable, rows, names, method, fixed = found
     if names is None:
         z = conserved.selected
@@ -182,7 +182,8 @@ def controllability(lin: LinearModel) -> Controllability:
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
-    fixed = fixed._replace(margin=conserved.margin & fixed.margin)
+    margin = conserved.margin & fixed.margin.transformed(conserved.rates)
+    fixed = fixed._replace(margin=margin, settling=fixed.settling.transformed(conserved.rates))
     if len(zero):
         fixed = fixed._replace(decays=False, settling=ranks.Margin())
     groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
@@ -237,8 +238,8 @@ def _by_second_order(
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # The inputs act on every momentum that is not conserved, so all remaining states are
         # controllable.
-        everything, fixed = np.eye(2 * r), ranks.FixedPoles(margin=margin.transformed(R))
-        return everything, everything[:0], [], "closed form", fixed
+        everything = np.eye(2 * r)
+        return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
     S = system.S.T
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
@@ -255,7 +256,6 @@ def _by_second_order(
         (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
     )
     controllable[:r] = np.linalg.solve(to_s, controllable[:r])
-    fixed = fixed.transformed(R)
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed

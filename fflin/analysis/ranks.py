@@ -78,11 +78,6 @@ class FixedPoles(NamedTuple):
     margin: Margin = Margin()  # margin of the rank decisions
     settling: Margin = Margin()  # certainty that the slowest pole decays
 
-    def transformed(self, change: Array) -> FixedPoles:
-        """Return the poles, with the directions of the margins in transformed coordinates."""
-        margin, settling = self.margin.transformed(change), self.settling.transformed(change)
-        return self._replace(margin=margin, settling=settling)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RankAnalysis(FrozenArrays):

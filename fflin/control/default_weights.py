@@ -66,8 +66,11 @@ class Pace(NamedTuple):
     held: float = _HELD  # [rad], largest rate of a mode times the hold
 
 
-# Largest bandwidth that a limit permits, and the description of the limit.
-Limit: TypeAlias = tuple[float, str]
+class Limit(NamedTuple):
+    """Largest bandwidth [rad/s] that a limit permits, and the description of the limit."""
+
+    bandwidth: float
+    what: str
 
 
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
@@ -151,14 +154,14 @@ def _of_inertia(
     use = _largest_use(gain, size, lin.state_names)
     speeds = _limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0)
     efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
-    limit, achieved = min([(pace.bandwidth, ""), *speeds, *efforts]), ""
+    limit, achieved = min([Limit(pace.bandwidth, ""), *speeds, *efforts]), ""
     rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
         growth, mode = _growth(lin)
-        limit = max(limit, (_OF_GROWTH * growth, mode))
+        limit = max(limit, Limit(_OF_GROWTH * growth, mode))
     if pace.hold:
-        limit = min(limit, (float(pace.held / (pace.hold * rates[-1])), "the sampling time"))
+        limit = min(limit, Limit(pace.held / (pace.hold * float(rates[-1])), "the sampling time"))
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -170,13 +173,13 @@ def _of_inertia(
         return Q, np.diag(h * cost / w**4)
 
     if loaded:
-        least = min((_LEAST_OF_GROWTH * growth, mode), limit)
+        least = min(Limit(_LEAST_OF_GROWTH * growth, mode), limit)
         limit, achieved = _slowed(lin, costs, size, size * ~idle, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
         "; joint damping is included" if damped else ""
     )
     terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
-    return *costs(limit[0]), rule, limit[0], terms
+    return *costs(limit.bandwidth), rule, limit.bandwidth, terms
 
 
 def _on_velocities(
@@ -255,12 +258,12 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
         each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
         from_where.append(f"{each} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
-    slow = f"; bandwidth limited by {limit[1]}" if limit[1] else ""
+    slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += (
             f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
         )
-    pace = achieved or f"bandwidth at least {limit[0]:.3g} rad/s"
+    pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
     return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
 
 
@@ -284,7 +287,7 @@ def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) 
     `power`.
     """
     return [
-        ((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
+        Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]
@@ -302,7 +305,7 @@ def _growth(lin: LinearModel) -> Limit:
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
     moving = listed(_moving_most(lin, modes[:, [k]]))
-    return fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})"
+    return Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
 
 
 def _slowed(
@@ -324,8 +327,7 @@ def _slowed(
     # this effort, the bandwidth, a report and the inputs (nu,).
     trials = list[tuple[float, str, Limit, str, Array]]()
     for _ in range(_TRIALS):
-        w, _ = limit
-        Q, R = costs(w)
+        Q, R = costs(w := limit.bandwidth)
         try:
             K = solve(lin.A, lin.B, Q, R, None, lin.dt).K
         except np.linalg.LinAlgError:
@@ -339,7 +341,8 @@ def _slowed(
             _largest_use(K, size, lin.state_names),
             _largest_use(later, driven, lin.state_names).max(axis=0),
         )
-        left, effort = min(_limits_on("effort", _efforts_left(lin), use, 2.0), default=(1.0, ""))
+        efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
+        left, effort = min(efforts, default=Limit(1.0, ""))
         decay, fast = -rates.real, np.abs(rates)
         said = (
             f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
@@ -351,11 +354,11 @@ def _slowed(
         if left >= 1.0 - 1e-6:
             return limit, said
         trials.append((left, effort, limit, said, np.abs(lin.u0) + use))
-        if w <= least[0]:
+        if w <= least.bandwidth:
             break
         # Springs and gravity require efforts even if the loop is very slow, so the bandwidth is
         # reduced in steps.
-        limit = max((min(max(left, 0.3), 0.8) * w, effort), least)
+        limit = max(Limit(min(max(left, 0.3), 0.8) * w, effort), least)
     if not trials:
         return limit, ""  # the design of the regulator fails and reports the reason
     enough = _IN_VAIN * max(left for left, *_ in trials)
@@ -364,11 +367,9 @@ def _slowed(
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
-    held = reason == least[1]  # a slower loop cannot control the unstable mode
-    return (
-        w,
-        f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}",
-    ), said
+    held = reason == least.what  # a slower loop cannot control the unstable mode
+    what = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    return Limit(w, what), said
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:

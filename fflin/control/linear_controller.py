@@ -297,10 +297,8 @@ def _system_of(given: Any) -> System:
             ) from None
     if not all(hasattr(given, key) for key in "ABC"):
         return _checked(None, None, None, as_double("system", given))
-    inputs, outputs = (
-        getattr(given, f"{kind}_names", getattr(given, f"{kind}_labels", ()))
-        for kind in ("input", "output")
-    )
+    inputs = getattr(given, "input_names", getattr(given, "input_labels", ()))
+    outputs = getattr(given, "output_names", getattr(given, "output_labels", ()))
     dt = getattr(given, "dt", None)
     # A system without signal names and with dt = None is a continuous system of SciPy.
     dt = 0.0 if dt is None and not inputs else dt
@@ -340,10 +338,8 @@ def _read(path: Path) -> System:
             found = struct  # a MATLAB struct
         dt = found.get("dt", found.get("Ts"))
         dt = None if dt is None else float(np.asarray(dt).item())
-        inputs, outputs = (
-            texts(found.get(f"{kind}_names", found.get(f"{kind.title()}Name", ())))
-            for kind in ("input", "output")
-        )
+        inputs = texts(found.get("input_names", found.get("InputName", ())))
+        outputs = texts(found.get("output_names", found.get("OutputName", ())))
     A, B, C, D = (found.get(key) for key in "ABCD")
     given = [each is not None for each in (A, B, C)]
     if not all(given) and (any(given) or D is None):

@@ -9,7 +9,6 @@ import pinocchio as pin
 
 from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
-from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
@@ -169,8 +168,7 @@ class AllocatedPolicy:
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
-        design = StateMap(allocation.design, reference=reference, frame=frame)
-        self._design = Actuation(design)
+        self._design = Actuation(StateMap(allocation.design, reference=reference, frame=frame))
         self._robot = Actuation(StateMap(robot, reference=reference, frame=frame))
         names = self._design.names
         free = np.full(len(names), np.inf)
@@ -183,11 +181,8 @@ class AllocatedPolicy:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on a run: how the commands are realised, and the notes of the inner policy."""
-        asked, given = (
-            list(dict.fromkeys(group_of(key) for key in input_keys(each)))
-            for each in (self._design, self._robot)
-        )
-        said = f"allocation: the commanded {', '.join(asked)} are realised by {', '.join(given)}"
+        asked, given = (", ".join(each.groups) for each in (self._design, self._robot))
+        said = f"allocation: the commanded {asked} are realised by {given}"
         same = self._design.names == self._robot.names
         return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 

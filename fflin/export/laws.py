@@ -239,10 +239,8 @@ def _output_law(given: OfOutputs, robot: Robot) -> Law:
         terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
         sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
         known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
-        inputs, signals = (
-            (names, tuple(known.get(name, "unknown") for name in names))
-            for names in (given.output_names, given.input_names)
-        )
+        inputs = given.output_names, tuple(known.get(x, "unknown") for x in given.output_names)
+        signals = given.input_names, tuple(known.get(x, "unknown") for x in given.input_names)
     if not given.dt and len(terms.A):
         raise InputError(
             "the controller is continuous, expected a sampled controller; use "

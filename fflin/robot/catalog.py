@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from fflin.base.errors import FileError, InputError, require_known, unknown
+from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.validation import instance
 from fflin.base.writing import as_path, missing, shown
 
@@ -91,13 +91,11 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by its bundled name, or otherwise by its path."""
-    path = as_path(inputs)
-    bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
-    if str(inputs) in bundled:
-        return bundled[str(inputs)]
-    if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
-        raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
-    return path
+    path, name = as_path(inputs), str(inputs)
+    bundled = {each.stem: each for each in sorted(bundled_directory().glob("*.toml"))}
+    if path.name == name and not path.suffix and not os.path.lexists(path):
+        require_known("file or bundled set of inputs", [name], bundled)
+    return bundled.get(name, path)
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:

@@ -21,7 +21,7 @@ from fflin.base.errors import InputError, SingularInertiaError, listed, require_
 from fflin.base.names import by_name, matching
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, instance, number, positive, shaped, vector, whole
-from fflin.robot.joints import ROOT, Joint, find_frame
+from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
 
 if TYPE_CHECKING:
@@ -325,11 +325,11 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
     busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
     if named:
         busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
-    free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
-    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
+    free = {name: index for name, index in index_of.items() if index not in busy}
+    return tuple(name for name, index in free.items() if _is_symmetric(robot, index))
 
 
-def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:
+def _is_symmetric(robot: Robot, index: int) -> bool:
     """Return whether the body of a joint is symmetric about the joint axis."""
     pin_joint = robot.model.joints[index]
     data = pin_joint.createData()

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
+from time import perf_counter
 from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.process import LONG_RUN
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
+from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
@@ -26,6 +30,13 @@ from fflin.simulation.run import Conserved, Disturbance, Recording, go
 # deviation from the operating point consists of the robot's states, followed by the states of a
 # continuous-time controller.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
+
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. A run
+# then takes about the fraction _FRACTION of the time. Compiling takes about _COMPILING seconds, but
+# only once.
+_FRACTION, _COMPILING = 0.1, 30.0
+
+_log = logging.getLogger("fflin")
 
 
 def simulate(
@@ -191,8 +202,14 @@ def simulate(
     plan = Plan(SimulationOptions(**locals()))
     foresees, compiled = predictor(plan), engine_of(engine, plan) == "compiled"
     hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
+    began = perf_counter()
     try:
-        return motion_of(plan, recorded(plan) if compiled else go(plan, hint), foresees)
+        run = recorded(plan) if compiled else go(plan, hint)
+        if hint and (spent := perf_counter() - began) > LONG_RUN:
+            once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
+            said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
+            _log.warning(f"fflin: {said} would take about %.0f s%s", spent, _FRACTION * spent, once)
+        return motion_of(plan, run, foresees)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "

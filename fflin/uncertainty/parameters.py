@@ -21,11 +21,8 @@ AXES = "xyz"
 # (row, column) of the six entries of an inertia.
 ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
 # Parameters of a link or body.
-OF_PIECES = {
-    *("mass", "density"),
-    *(f"com.{axis}" for axis in AXES),
-    *(f"inertia.{entry}" for entry in ENTRIES),
-}
+OF_PIECES = {"mass", "density", *(f"com.{axis}" for axis in AXES)}
+OF_PIECES |= {f"inertia.{entry}" for entry in ENTRIES}
 _ROUNDING = 1e-9
 _TURN = 2.0 * math.pi  # [rad]
 
@@ -232,10 +229,8 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))
-                for part, unit, at_joint, wrench in (
-                    ("position", "m", where, moved),
-                    ("direction", "1", along, tilted),
-                ):
+                changes = ("position", "m", where, moved), ("direction", "1", along, tilted)
+                for part, unit, at_joint, wrench in changes:
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
                     made = Parameter(names[0], f"{part}.{letter}", unit, float(at_joint @ d))
                     yield replace(made, wrench=(joint, first, in_joint))

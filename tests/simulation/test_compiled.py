@@ -383,6 +383,16 @@ def test_a_command_that_is_no_number_is_told(robots):
     assert "tau_b.x" in said[0]
 
 
+def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(robots, monkeypatch, caplog):
+    monkeypatch.setattr("fflin.simulation.simulate.LONG_RUN", 0.0)
+    options = {"duration": 0.1, "linear": False}
+    fflin.simulate(robots["cubesat"], **options, engine="python")
+    (record,) = caplog.records
+    assert "--engine compiled" in record.message
+    fflin.simulate(robots["cubesat"], **options, events=[lambda t, q, v: 1.0])
+    assert len(caplog.records) == 1  # which the compiled loop does not do
+
+
 def test_a_run_in_python_names_the_compiled_loop_if_it_can_run_there(robots, monkeypatch):
     hints = []
 

@@ -72,14 +72,12 @@ def describe(document: bytes, path: Path) -> Urdf:
     while root_joint in joints or root_joint in links:
         root_joint += "_"
     name = root.attributes.get("name", "").strip()
-    clean = write_urdf(name, links, joints)
+    clean, base = write_urdf(name, links, joints), pin.JointModelFreeFlyer()
     try:
         with ThreadPoolExecutor(1) as other:
             usual = threading.stack_size(_STACK)
             try:
-                built = other.submit(
-                    pin.buildModelFromXML, clean, pin.JointModelFreeFlyer(), root_joint
-                )
+                built = other.submit(pin.buildModelFromXML, clean, base, root_joint)
             finally:
                 threading.stack_size(usual)
         model: pin.Model = built.result()
