@@ -155,10 +155,8 @@ class LinearBatch(validation.Result):
     @property
     def B(self) -> Array:
         """Input matrices B (N, nx, nu), with zero upper halves; computed at each access."""
-        count, nv, nu = self.B_lower.shape
-        B = np.zeros((count, 2 * nv, nu))
-        B[:, nv:] = self.B_lower
-        return frozen(B)
+        upper = np.zeros(self.B_lower.shape)
+        return frozen(np.concatenate((upper, self.B_lower), axis=1))
 
     @property
     def x0(self) -> Array:

@@ -290,7 +290,7 @@ class Sensing:
 
 
 class Measuring:
-    """Outputs y by elementary kinematics, to check C and D.
+    """Outputs y by kinematics without derivatives, to check C and D.
 
     Rotations of frames are relative to their attitude at the configuration q.
     """

@@ -128,7 +128,13 @@ class LinearTrajectory(Trajectory):
         return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self, *, tolerance: float | None = None) -> Check:
-        """Check the linear model at every knot by `fflin.check`, and return the largest errors."""
+        """Check the linear model at every knot by `fflin.check`, and return the largest errors.
+
+        Parameters
+        ----------
+        tolerance : float, optional
+            Relative tolerance for all errors, instead of the default tolerances of `check`.
+        """
         title = f"{self.robot.name}, {len(self)} knots"
         return check_all(self.robot, self, title, tolerance=tolerance)
 

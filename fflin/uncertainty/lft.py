@@ -162,13 +162,10 @@ class LFT(Design):
             raise InputError(
                 "the inertia M is singular at these parameters; give narrower ranges"
             ) from None
-        nx, by = len(self.A), delta[..., None] * z
-        return (
-            self.A + self.B1 @ by[..., :nx],
-            self.B2 + self.B1 @ by[..., nx:],
-            self.C2 + self.D21 @ by[..., :nx],
-            self.D22 + self.D21 @ by[..., nx:],
-        )
+        # Signals w per unit of the states and of the inputs.
+        x, u = np.split(delta[..., None] * z, [len(self.A)], axis=-1)
+        A, B = self.A + self.B1 @ x, self.B2 + self.B1 @ u
+        return A, B, self.C2 + self.D21 @ x, self.D22 + self.D21 @ u
 
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from (w, u) to (z, y), with signal names.

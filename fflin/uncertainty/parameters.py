@@ -229,10 +229,8 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))
-                for part, unit, at_joint, wrench in (
-                    ("position", "m", where, moved),
-                    ("direction", "1", along, tilted),
-                ):
+                changes = ("position", "m", where, moved), ("direction", "1", along, tilted)
+                for part, unit, at_joint, wrench in changes:
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
                     made = Parameter(names[0], f"{part}.{letter}", unit, float(at_joint @ d))
                     yield replace(made, wrench=(joint, first, in_joint))

@@ -115,9 +115,8 @@ class Sensitivity:
     def __getitem__(self, name: str) -> Derivatives:
         """Return the derivatives with respect to one parameter."""
         one = self._one(name)
-        return Derivatives(
-            one.name, one.unit, one.value, *(x[0] for x in self._derivatives.over([one]))
-        )
+        matrices = self._derivatives.over([one])
+        return Derivatives(one.name, one.unit, one.value, *(x[0] for x in matrices))
 
     def _one(self, name: str) -> Parameter:
         found = self.parameters.find(name)
@@ -144,10 +143,8 @@ class Sensitivity:
         if not named:
             raise InputError("direction is empty, expected {parameter: change}")
         matrices = self._derivatives.over([self.parameters[name] for name in named])
-        weights = [*named.values()]
-        return Derivatives(
-            " + ".join(given), "1", 0.0, *(np.tensordot(weights, x, 1) for x in matrices)
-        )
+        changes = (np.tensordot([*named.values()], x, 1) for x in matrices)
+        return Derivatives(" + ".join(given), "1", 0.0, *changes)
 
     @cached_property
     def _all(self) -> tuple[Array, ...]:
@@ -248,24 +245,23 @@ class Sensitivity:
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
                 percents = (f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect)
-                rows.append(
-                    (max(effect), one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents)
-                )
+                said = one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents
+                rows.append((max(effect), *said))
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
         if not most:
             return f"{lin.robot}: none of these parameters changes A or B"
         name, unit, _, step, *_ = most[0]
         change = step if unit == "." else f"{step} {unit}"
-        title = folded(
-            [
-                f"{lin.robot}: {name} changes A and B most: if it changes by {change}, A or B "
-                f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
-            ]
+        title = (
+            f"{lin.robot}: {name} changes A and B most: if it changes by {change}, A or B "
+            f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
         )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
         more = f"... and {len(rows) - top} more, see --top"
-        return "\n".join([title, "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)])
+        return "\n".join(
+            [folded([title]), "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)]
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.

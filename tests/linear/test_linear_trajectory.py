@@ -269,6 +269,9 @@ def test_a_check_goes_along_it(watched):
         ("ABA derivatives", "A[v_b, omega_b]"),
         ("differences", "A[v_b, omega_b]"),
     }
+    loose = replace(short, A=wrong).check(tolerance=1e-5)
+    assert loose.ok and {row.tolerance for row in loose.rows} == {1e-5}
+    assert "4 knots, each error at most 1.0e-05" in str(loose)
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "json"])
