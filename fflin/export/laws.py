@@ -180,9 +180,8 @@ def _state_cases(
             turn = np.array((1.0, 0.0, 0.0, 0.0))
         turn = quaternion_product(about[3:], turn / norm(turn))
         q[3:7] = quaternion_product(conjugate(world.origin_quaternion), turn)
-        q[:3] = world.origin.rotation.T @ (
-            about[:3] + random.normal(size=3) - world.origin.translation
-        )
+        origin = world.origin
+        q[:3] = origin.rotation.T @ (about[:3] + random.normal(size=3) - origin.translation)
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
@@ -228,7 +227,6 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
 
 
 def _output_law(given: OfOutputs, robot: Robot) -> Law:
-    lin = None
     if isinstance(given, LinearController):
         terms, lin = given.terms(), given.lin
         inputs, signals = (lin.input_names, lin.input_units), (lin.output_names, lin.output_units)
@@ -255,7 +253,7 @@ def _output_law(given: OfOutputs, robot: Robot) -> Law:
         inputs=inputs,
         dt=given.dt,
         robot=robot,
-        lin=lin,
+        lin=getattr(given, "lin", None),
         tables=tables,
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
