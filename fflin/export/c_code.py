@@ -249,8 +249,7 @@ class CLaw:
         if self._about["kind"] == "output":
             q, v = map(np.array, self._about["point"])
             there, sizes = (Measuring(state, q), state.read(q, v)), (self._about["memory"], 0)
-            step = self._output_step
-            return Loop(state, self.dt, sizes, lambda t: (partial(step, t), *there))
+            return Loop(state, self.dt, sizes, lambda t: (partial(self._output_step, t), *there))
         world, n = StateMap(robot, frame=state.frame), robot.n
         # C has no empty arrays, so an array for joints has at least one entry.
         room = max(n, 1)
@@ -369,9 +368,8 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
     }
     about["sha256"] = digest_of(about, header.encode(), source.encode())
-    described = json.dumps(about, indent=1) + "\n"
-    test = _filled("test.c", words)
-    return title, {".h": header, ".c": source, "_test.c": test, ".json": described}
+    code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
+    return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:

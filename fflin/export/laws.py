@@ -18,7 +18,7 @@ from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
-from fflin.dynamics.state import Actuation, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import Signals, signals_of
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits
@@ -95,11 +95,10 @@ def law_of(given: object, robot: object, limits: object) -> Law:
         )
     robot = instance("robot", robot, Robot, "a Robot")
     law = _output_law(given, robot) if isinstance(given, OfOutputs) else _state_law(given, robot)
-    names, _ = law.inputs
-    high = np.full(len(names), np.inf)
+    high = np.full(len(law.inputs[0]), np.inf)
     low = -high
     if limits is not None:
-        if Actuation(StateMap(robot)).names != tuple(names):
+        if signals_of(StateMap(robot), "input")[0] != law.inputs[0]:
             raise InputError(
                 "limits need the robot with the inputs of the law; give the robot of the design "
                 "with robot= (--robot)"
@@ -133,10 +132,9 @@ def _state_law(given: OfStates, robot: Robot) -> Law:
     tables["in_reference_axes"] = np.array(state.axes)
     tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
     if axes:
-        sizes = [*map(len, axes.values())]
         tables["axis_joint"] = np.array([*map(robot.joint_names.index, axes)])
-        tables["axis_size"] = np.array(sizes)
-        padded = [np.pad(x, (0, max(sizes) - len(x))) for x in axes.values()]
+        tables["axis_size"] = sizes = np.array([*map(len, axes.values())])
+        padded = [np.pad(x, (0, sizes.max() - len(x))) for x in axes.values()]
         tables["axis_points"] = np.array(padded)
     cells = (np.abs(x).max() / np.diff(x).min() for x in axes.values())
     return Law(
@@ -182,8 +180,9 @@ def _state_cases(
             turn = np.array((1.0, 0.0, 0.0, 0.0))
         turn = quaternion_product(about[3:], turn / norm(turn))
         q[3:7] = quaternion_product(conjugate(world.origin_quaternion), turn)
-        there = about[:3] + random.normal(size=3)
-        q[:3] = world.origin.rotation.T @ (there - world.origin.translation)
+        q[:3] = world.origin.rotation.T @ (
+            about[:3] + random.normal(size=3) - world.origin.translation
+        )
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
@@ -220,10 +219,9 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
     attitudes = [quaternion_product(state.origin_quaternion, each) for each in q[:, 3:7]]
-    pose = np.zeros((len(q), 6))
     return {
         "reference": np.hstack((state.positions(q), attitudes)),
-        "x0": np.hstack((pose, state.joint_positions(q), state.velocities(v))),
+        "x0": np.hstack((np.zeros((len(q), 6)), state.joint_positions(q), state.velocities(v))),
         "u0": u0,
         "K": np.array([*map(policy.gain, times)]),
     }
@@ -281,5 +279,4 @@ def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
         of_z, of_y = np.abs(z), np.abs(y) + np.abs(by.y0) + np.abs(turns)
         scale = np.abs(by.u0) + np.abs(by.C) @ of_z + np.abs(by.D) @ of_y
         after = np.abs(by.A) @ of_z + np.abs(by.B) @ of_y
-        out, scales = np.append(u, next_z), np.append(scale, after)
-        yield Case(0, np.append(z, y + turns), out, scales)
+        yield Case(0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after))
