@@ -397,10 +397,11 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
         found: Array = bias + deviation * generator.standard_normal(len(bias))
         return found if given is None else found + np.asarray(given(t))
 
-    if not isinstance(policy, StateFeedback):
+    if isinstance(policy, LinearController | TrajectoryOutputFeedback):
         noisy = copy(policy)
-        vars(noisy)["noise"] = error
+        noisy.noise = error
         return noisy
+    assert isinstance(policy, StateFeedback)
     K = policy.K
 
     def bind(robot: Robot) -> Policy:
