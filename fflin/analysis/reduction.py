@@ -14,7 +14,7 @@ from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import StateMap, selection
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import frame_index
@@ -345,11 +345,6 @@ def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> Li
     for key in ("output_names", "output_units"):
         values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
     return certified(LinearModel(**values), lin, make)
-
-
-def selection(names: Sequence[str], of: Sequence[str]) -> Array:
-    """Return the matrix S (k, n) that selects some of n names."""
-    return np.eye(len(of))[[of.index(name) for name in names]]
 
 
 def outputs_of(lin: LinearModel, S: Array) -> Array:

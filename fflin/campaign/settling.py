@@ -10,14 +10,14 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fflin.analysis.reduction import regulated_part, selection, wheel_inputs
+from fflin.analysis.reduction import regulated_part, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError, listed
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import Design
@@ -19,7 +18,7 @@ from fflin.base.tables import cut, grid, matrix, width
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
 from fflin.linear.model import ControlSystem, LinearModel, state_space
 

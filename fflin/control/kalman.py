@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
-from fflin.analysis.reduction import outputs_of, regulated_part, selection
+from fflin.analysis.reduction import outputs_of, regulated_part
 from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
@@ -20,6 +20,7 @@ from fflin.control.optimal.riccati import solve
 from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time, steady_end
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
+from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 from fflin.linear.model import ControlSystem, LinearModel, state_space
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fflin.analysis.controllability import require_stabilizable, require_weighed
-from fflin.analysis.reduction import regulated_part, selection
+from fflin.analysis.reduction import regulated_part
 from fflin.base.errors import (
     EquilibriumError,
     FflinWarning,
@@ -19,6 +19,7 @@ from fflin.control.default_weights import Pace
 from fflin.control.gain import Gain, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
+from fflin.dynamics.state import selection
 from fflin.linear.model import LinearModel
 
 # A relative residual above _COARSE raises a warning, and one above _USELESS raises an error.

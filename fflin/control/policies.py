@@ -7,14 +7,13 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.reduction import selection
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import Actuation, Frame, StateMap
+from fflin.dynamics.state import Actuation, Frame, StateMap, selection
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.model import LinearModel

@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.reduction import (
-    ignorable_wheels,
-    regulated_part,
-    rigid_forces,
-    selection,
-    without,
-)
+from fflin.analysis.reduction import ignorable_wheels, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, instance, number, numbers, positive, shaped
 from fflin.control.default_weights import Pace, default_weights
 from fflin.dynamics.integrators import held_cost
+from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from itertools import compress
 from operator import attrgetter
@@ -459,3 +460,8 @@ class Actuation:
         for joint, inputs, wrenches in self.wrench_columns:
             external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
         return external
+
+
+def selection(names: Sequence[str], of: Sequence[str]) -> Array:
+    """Return the matrix S (k, n) that selects some of n names."""
+    return np.eye(len(of))[[of.index(name) for name in names]]
