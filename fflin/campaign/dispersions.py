@@ -25,7 +25,7 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree, batch_tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible, turned_to
-from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import bodies_named, properties, varied
 from fflin.robot.robot import Robot
@@ -486,7 +486,7 @@ def _mounted(
 ) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int, Array]]:
     """Yield thrusters and wheels: index in `robot.inputs`, item, names, index in u, direction."""
     first = 0
-    for place, (item, names) in enumerate(named_inputs(robot.inputs)):
+    for place, (item, names) in enumerate(robot.named_inputs):
         if isinstance(item, Thruster | ReactionWheel):
             direction = item.direction if isinstance(item, Thruster) else item.axis
             yield place, item, names, first, np.array(direction)

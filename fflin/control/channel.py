@@ -13,8 +13,7 @@ from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
 from fflin.kernel import loop as rules
 from fflin.kernel.tree import empty
-from fflin.robot.fields import Range, input_limits, pulsed_thrusters
-from fflin.robot.inputs import named_inputs
+from fflin.robot.fields import Range, input_limits
 from fflin.robot.robot import Robot
 
 Inputs: TypeAlias = Callable[..., Array]
@@ -45,7 +44,7 @@ def saturation(
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
     if spun := [name for name in robot.wheels if f"qdot_m.{name}" in limits]:
-        names = [name for _, group in named_inputs(robot.inputs) for name in group]
+        names = [name for _, group in robot.named_inputs for name in group]
         at, of_v = [names.index(x) for x in spun], [robot.joint(x).idx_v for x in spun]
         mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[of_v]
         least_speed, most_speed = np.array([limits[f"qdot_m.{name}"] for name in spun]).T
@@ -59,7 +58,7 @@ def saturation(
             stiffness=1.0 / (mobility * dt),
         )
         within = within._replace(wheels=wheels)
-    if not (pulsed and (thrusters := pulsed_thrusters(robot))):
+    if not (pulsed and (thrusters := robot.pulsed_thrusters)):
         return within
     at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])

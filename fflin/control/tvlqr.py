@@ -29,7 +29,6 @@ from fflin.linear.linear_trajectory import LinearTrajectory, transitions
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
-from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -410,7 +409,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     """Return the model at rest at knot `end`, in base axes; rotors keep spinning."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
-    rotors = rotor_names(robot)
+    rotors = robot.rotors
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
     v[spinning] = traj.v[end, spinning]
     held = equilibrium(robot, q, v=v)

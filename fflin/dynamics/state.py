@@ -389,7 +389,7 @@ class Actuation:
         # (index of the input, wrench (6,) of a unit input in the joint's frame)}.
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item, own in kinds.named_inputs(robot.inputs):
+        for item, own in robot.named_inputs:
             at, unit = len(columns), item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
                 rows = ANGULAR if isinstance(item, kinds.BaseTorque) else LINEAR

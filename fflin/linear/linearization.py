@@ -21,7 +21,7 @@ from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
 from fflin.robot.fields import magnitudes_of
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import require_inertia, rotor_names
+from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -133,7 +133,7 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # position and attitude.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
-    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in rotor_names(robot)))
+    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
 
 
 class Linearizer:

@@ -23,7 +23,6 @@ from fflin.dynamics.coordinates import frame_of, refuse_orbit
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -363,7 +362,7 @@ class Trajectory(Design):
         terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
         # Largest magnitudes over all knots; infinite or NaN entries count as zero.
         push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
-        rotors = rotor_names(state.robot)
+        rotors = state.robot.rotors
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         speed = np.abs(v).max(axis=0)

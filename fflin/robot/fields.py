@@ -12,7 +12,7 @@ import numpy as np
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.validation import Array, dimension, number, numbers
-from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, named_inputs, three_numbers
+from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, three_numbers
 from fflin.robot.joints import Joint, by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
@@ -30,7 +30,7 @@ RULES = ("urdf", "identity")
 
 def _input_keys(robot: Robot) -> tuple[str, ...]:
     """Return input names with groups, such as "thrust.NAME"; see `fflin.base.names.input_keys`."""
-    pairs = ((item.GROUP, name) for item, names in named_inputs(robot.inputs) for name in names)
+    pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
@@ -39,7 +39,7 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
 
     The limits are given by name, or as one limit for all inputs.
     """
-    named = named_inputs(robot.inputs)
+    named = robot.named_inputs
     keys, states = _input_keys(robot), state_keys(robot.joint_names)
     names = [*(name for _, own in named for name in own), *states]
     floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
@@ -190,7 +190,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
         low, high = travel_of(robot.model, joint)
         found[f"q_m.{joint.name}"] = (low, high) if low < high else _OPEN
         found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
-    for item, names in named_inputs(robot.inputs):
+    for item, names in robot.named_inputs:
         found |= dict(zip(names, item.ranges, strict=True))
         if isinstance(item, JointTorque) and item.max is None:
             low, high = _either(float(robot.model.effortLimit[robot.joint(item.joint).idx_v]))
@@ -204,10 +204,10 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
     """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
-    inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
+    inputs = {name: item for item, names in robot.named_inputs for name in names}
     low, high = np.array([limits.get(name, _OPEN) for name in inputs]).T
     low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
-    for index, (_, item) in pulsed_thrusters(robot).items():
+    for index, (_, item) in robot.pulsed_thrusters.items():
         high[index] = min(high[index], item.max or math.inf)
     for name, least, largest in zip(inputs, low.tolist(), high.tolist(), strict=True):
         if least > largest:
@@ -220,7 +220,7 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
 
 def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
     """Return the pulsed thrusters {index of the input: (name, thruster)}."""
-    inputs = ((name, item) for item, names in named_inputs(robot.inputs) for name in names)
+    inputs = ((name, item) for item, names in robot.named_inputs for name in names)
     return {
         index: (name, item)
         for index, (name, item) in enumerate(inputs)

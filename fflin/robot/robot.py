@@ -17,8 +17,8 @@ from fflin.base.validation import Array
 from fflin.robot import mass_properties
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
-from fflin.robot.fields import FIELDS, Range, checked_passive
-from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
+from fflin.robot.fields import FIELDS, Range, checked_passive, pulsed_thrusters
+from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
@@ -360,7 +360,14 @@ class Robot(Coordinates):
         of_inputs = [name for item in self.inputs for name in item.frames]
         return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
+    @cached_property
+    def named_inputs(self) -> tuple[tuple[Input, tuple[str, ...]], ...]:
+        """Each input with the names of its entries in u."""
+        return tuple(named_inputs(self.inputs))
+
+    pulsed_thrusters = cached_property(pulsed_thrusters)
     idle_coordinates = cached_property(mass_properties.idle_coordinates)
+    rotors = cached_property(mass_properties.rotor_names)
 
     @cached_property
     def wheels(self) -> dict[str, float]:
@@ -376,7 +383,7 @@ class Robot(Coordinates):
         given = (self.stiffness, self.damping, self.rest)
         return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
 
-    @property
+    @cached_property
     def mass(self) -> float:
         """Total mass [kg]."""
         return float(sum(inertia.mass for inertia in self.model.inertias.tolist()[ROOT:]))

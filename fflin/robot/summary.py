@@ -13,7 +13,6 @@ import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.fields import limits_of, travel_of
-from fflin.robot.inputs import named_inputs
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -31,7 +30,7 @@ _SWING, _DAMPED = math.pi, 0.01
 def robot_info(robot: Robot, at_point: str = "") -> str:
     """Return text about a robot's tree, masses and limits; `at_point` follows the first lines."""
     modes = {joint.name for joint in robot.modes}
-    inputs = sum(len(names) for _, names in named_inputs(robot.inputs))
+    inputs = sum(len(names) for _, names in robot.named_inputs)
     counts = [
         counted(robot.n - len(modes), "joint"),
         *[counted(len(modes), "mode")] * bool(modes),

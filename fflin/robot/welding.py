@@ -11,7 +11,7 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
-from fflin.robot.inputs import ReactionWheel, named_inputs
+from fflin.robot.inputs import ReactionWheel
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import dynamic_parameters, link_mass
 from fflin.robot.outputs import JointOutput
@@ -31,7 +31,7 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     gone = wheels | {each.rpartition("=")[0] for each in locked}
     inputs = [
         replace(item, name=names[0]) if isinstance(item, ReactionWheel) else item
-        for item, names in named_inputs(robot.inputs)
+        for item, names in robot.named_inputs
         if getattr(item, "joint", names[0]) not in gone
     ]
     if not inputs:

@@ -27,7 +27,6 @@ from fflin.dynamics.integrators import held_exponential, integrator
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
-from fflin.robot.mass_properties import rotor_names
 from fflin.robot.robot import Robot
 from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
 
@@ -156,7 +155,7 @@ class Plan:
         self.project = truth("project", options.project) and robot.orbit is None
         # Indices in v of the angular rates whose rotation per step is bounded: base and revolute
         # joints, but not rotors, because nothing depends on the angle of a rotor.
-        rotors, joints = rotor_names(robot), robot.joints
+        rotors, joints = robot.rotors, robot.joints
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.

@@ -12,7 +12,7 @@ from fflin.base.names import matching, stands_for_any
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, positive
 from fflin.robot.equipment.assembly import carrier
-from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
+from fflin.robot.inputs import ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import Piece, as_inertia, sums_of
 from fflin.robot.robot import Robot
@@ -108,7 +108,7 @@ class Parameters(dict[str, Parameter]):
             for part in springs.keys() & own.keys():
                 springs[part][joint.name] = own[part]
         inputs = list(robot.inputs)
-        for index, (item, names) in enumerate(named_inputs(robot.inputs)):
+        for index, (item, names) in enumerate(robot.named_inputs):
             own = parts.get(names[0], {})
             if isinstance(item, ReactionWheel) and "inertia" in own:
                 inputs[index] = replace(item, inertia=own["inertia"])
@@ -218,7 +218,7 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
     at = 0
-    for item, names in named_inputs(robot.inputs):
+    for item, names in robot.named_inputs:
         first, at = at, at + len(names)
         if isinstance(item, Thruster):
             joint, placement = find_frame(robot.model, item.frame)

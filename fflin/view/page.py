@@ -28,7 +28,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.orbital import OrbitField
 from fflin.robot.equipment.assembly import turned_to
-from fflin.robot.inputs import Thruster, named_inputs, named_wheels
+from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.view.shapes import PLAIN, Color, Indices, Mesh, Shape, bendings, load_mesh, shapes
@@ -336,7 +336,7 @@ class Page:
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
         # For each thruster: its name, node, position and direction of its force.
         self.nozzles: list[dict[str, object]] = []
-        for item, (name, *_) in named_inputs(robot.inputs):
+        for item, (name, *_) in robot.named_inputs:
             if isinstance(item, Thruster):
                 joint, placement = find_frame(robot.model, item.frame)
                 nozzle: dict[str, object] = {"name": name, "path": self.nodes[joint - ROOT]}
