@@ -8,7 +8,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import require_known
+from fflin.base.errors import unknown
 from fflin.base.validation import Array
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
@@ -113,7 +113,8 @@ INTEGRATORS: dict[str, type[Integrator]] = {
 
 def integrator(name: str) -> type[Integrator]:
     """Return the integrator with a name, or raise `UnknownNameError`."""
-    require_known("method", [str(name)], INTEGRATORS)
+    if str(name) not in INTEGRATORS:
+        raise unknown("method", str(name), INTEGRATORS)
     return INTEGRATORS[str(name)]
 
 

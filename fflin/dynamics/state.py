@@ -464,4 +464,4 @@ class Actuation:
 
 def selection(names: Sequence[str], of: Sequence[str]) -> Array:
     """Return the matrix S (k, n) that selects some of n names."""
-    return np.eye(len(of))[[of.index(name) for name in names]]
+    return np.eye(len(of))[[*map(of.index, names)]]

@@ -190,10 +190,11 @@ def limits_of(robot: Robot) -> dict[str, Range]:
         low, high = travel_of(robot.model, joint)
         found[f"q_m.{joint.name}"] = (low, high) if low < high else _OPEN
         found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
+    index = {joint.name: joint.idx_v for joint in robot.joints}
     for item, names in robot.named_inputs:
         found |= dict(zip(names, item.ranges, strict=True))
         if isinstance(item, JointTorque) and item.max is None:
-            low, high = _either(float(robot.model.effortLimit[robot.joint(item.joint).idx_v]))
+            low, high = _either(float(robot.model.effortLimit[index[item.joint]]))
             found[names[0]] = (low if item.min is None else item.ranges[0][0], high)
         if isinstance(item, ReactionWheel) and item.max_speed is not None:
             found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
@@ -204,17 +205,20 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
     """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
-    inputs = {name: item for item, names in robot.named_inputs for name in names}
-    low, high = np.array([limits.get(name, _OPEN) for name in inputs]).T
-    low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
-    for index, (_, item) in robot.pulsed_thrusters.items():
-        high[index] = min(high[index], item.max or math.inf)
-    for name, least, largest in zip(inputs, low.tolist(), high.tolist(), strict=True):
-        if least > largest:
-            raise InputError(
-                f"the lower limit of {name} is {least:g}, above its upper limit {largest:g}; "
-                "correct limits= or the limits of the input"
-            )
+    found: list[Range] = []
+    for item, names in robot.named_inputs:
+        for name in names:
+            least, largest = limits.get(name, _OPEN)
+            if pulsed := robot.pulsed_thrusters.get(len(found)):
+                largest = min(largest, pulsed[1].max or math.inf)
+            least = least if item.PULLS else max(least, 0.0)
+            if least > largest:
+                raise InputError(
+                    f"the lower limit of {name} is {least:g}, above its upper limit {largest:g}; "
+                    "correct limits= or the limits of the input"
+                )
+            found.append((least, largest))
+    low, high = np.array(found).T
     return low, high
 
 
