@@ -209,8 +209,8 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
     for item, names in robot.named_inputs:
         for name in names:
             least, largest = limits.get(name, _OPEN)
-            if pulsed := robot.pulsed_thrusters.get(len(found)):
-                largest = min(largest, pulsed[1].max or math.inf)
+            if len(found) in robot.pulsed_thrusters:
+                largest = min(largest, item.ranges[0][1])
             least = least if item.PULLS else max(least, 0.0)
             if least > largest:
                 raise InputError(

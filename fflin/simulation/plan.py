@@ -24,7 +24,7 @@ from fflin.control.tracking import followed, largest_rate, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Frame, StateMap, selection
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.robot import Robot
@@ -203,8 +203,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
             f"'{state.robot.name}' or a model of that robot about a fixed point"
             f"{f' in frame {state.frame!r}' * bool(state.robot.orbit)}"
         )
-    near = np.zeros(state.nx)
-    near[[state.names.index(name) for name in target.state_names]] = target.x0
+    near = selection(target.state_names, state.names).T @ target.x0
     return state.read(target.q, target.v, near=near)
 
 
