@@ -191,8 +191,8 @@ def _separated(frequencies: Array, L: Array) -> Array:
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Modes are first combined by their mass. Modes without mass are then combined by their
-        # moment of inertia.
+        # Combine the modes so that as few of them as possible have mass. Then combine the modes
+        # without mass so that as few of them as possible have a moment of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
@@ -21,8 +22,7 @@ _EPS = sys.float_info.epsilon
 
 def width() -> int:
     """Return the number of columns of the terminal, or 80 if the output is not a terminal."""
-    on_terminal = sys.stdout is not None and sys.stdout.isatty()
-    return shutil.get_terminal_size((80, 24)).columns if on_terminal else 80
+    return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
 
 
 def folded(lines: Iterable[str]) -> str:
@@ -50,8 +50,19 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
     return [*rows[: 1 + MOST_ROWS], [f"... and {left} more, {rest}", *[""] * (len(rows[0]) - 1)]]
 
 
+def dim(text: str) -> str:
+    """Return dimmed text if the output is a terminal with colours."""
+    if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+        return f"\x1b[2m{text}\x1b[0m"
+    return text
+
+
+def _on_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()
+
+
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
-    """Return rows of cells as text with aligned columns.
+    """Return rows of cells as text with aligned columns; a cell "." is dimmed.
 
     The letters of `align`, "l" or "r", align the first columns left or right. All further columns
     are aligned right.
@@ -64,7 +75,8 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
             cell.ljust(size) if side == "l" else cell.rjust(size)
             for cell, size, side in zip(row, sizes, align, strict=True)
         ]
-        lines.append(_GAP.join(cells).rstrip())
+        cells[-1] = cells[-1].rstrip()
+        lines.append(_GAP.join(dim(c) if c.strip() == "." else c for c in cells).rstrip())
     return "\n".join(lines)
 
 

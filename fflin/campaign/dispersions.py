@@ -174,8 +174,9 @@ class Dispersions:
     def _by_piece(
         self, kind: str, spreads: Mapping[str, tuple[Inverse, str]]
     ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
-        """Return {link or body: spread}, and {link or body: key} for keys without a wildcard.
+        """Return {link or body: spread}, and {link or body: its key in `spreads`}.
 
+        The second result omits links and bodies that only a pattern matches.
         A key without a wildcard overrides patterns that match the same link or body.
         """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()

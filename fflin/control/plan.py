@@ -142,9 +142,10 @@ def plan(
     shooting = Shooting(robot, t, hold == "previous")
     acting = chosen_limits(robot, limits)[0]
     low, high = input_limits(robot, acting)
-    size = np.maximum(np.abs(low), np.abs(high))
-    by_limits = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
-    matrix = weight("R", by_limits if R is None else R, input_keys(actuation), definite=True)
+    if R is None:
+        size = np.maximum(np.abs(low), np.abs(high))
+        R = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
+    matrix = weight("R", R, input_keys(actuation), definite=True)
     weights = matrix.diagonal()
     if (matrix != np.diag(weights)).any():
         raise InputError(

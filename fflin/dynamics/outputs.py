@@ -34,7 +34,10 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Robot with its base moved to the origin and v_b = 0, and the base motion thus removed."""
+    """Robot with its base moved to the origin and its linear base velocity set to zero.
+
+    R, r_b and v_b are the pose and the linear velocity of the base before this change.
+    """
 
     model: pin.Model
     data: pin.Data

@@ -11,10 +11,10 @@ the positions q and velocities q' are
     \partial\tau_i/\partial q_j &= (2 B_i^T S_i)^T \Psi'_j + (I_i S_i)^T \Psi''_j \\
     \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
 
-where I_i, B_i and f_i are the inertia, the Coriolis matrix and the force of joint i's subtree. For
-an angular velocity w, 2 B w is the force 2 w x p and the moment 2 (tr G - G) w + w x h. Here p is
-the momentum of the subtree, and h is its stored momentum. G = sum m v r^T are its first moments of
-momentum about the joint.
+where I_i, B_i and f_i are the inertia, the Coriolis matrix and the force of joint i's subtree. Let
+p be the momentum of the subtree, h its stored momentum, and G = sum m v r^T its first moments of
+momentum about the joint. For a rotation with the angular velocity w, the force part of 2 B w is
+2 w x p, and its moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
 
 References
 ----------

@@ -161,7 +161,7 @@ class LaneLoop:
         statistics.reset()
         most = max(1, min(-(-steps // every), _MEMORY // (8 * LANES * self.width)))
         space = work_space(most * self.width)
-        # A slice of most * every steps contains `most` recorded steps, wherever it begins.
+        # A slice of `most * every` steps contains `most` recorded steps, wherever it begins.
         span = min(most * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)

@@ -105,7 +105,8 @@ class Plan:
     """Checked arguments of `simulate`, and data derived from them; constant during the run."""
 
     def __init__(self, options: SimulationOptions) -> None:
-        robot, policy = options.robot, followed(options.policy, options.robot)
+        robot = instance("robot", options.robot, Robot, "a fflin.Robot; fflin.load makes one")
+        policy = followed(options.policy, robot)
         self.options = options
         self.times = times = times_of(policy, options)
         policy = followed(policy, robot, held=times.sample * times.dt)

@@ -78,7 +78,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits of which the values reach at least the fraction _NEAR."""
+        """Limits that the values come near, which means that they reach _NEAR times the limit."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 

@@ -16,8 +16,8 @@ the centre of mass is known. Each parameter multiplies the following number of s
 - 1 for a diagonal entry of the inertia, and 2 for an off-diagonal entry,
 - 4 for a coordinate of the centre of mass: 2 in T and 2 in T^T.
 
-These numbers are minimal, because each is the rank of the change of M: X has full rank on a free
-base.
+These numbers are minimal. Each of them is the rank of the change of the inertia matrix M with the
+parameter, because X has full rank on a free base.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class Shooting:
 
         The first array (N, nx, nx + 2 nu) contains the Jacobians of the ends. Its columns belong to
         z at the start, and to the inputs at both knots. The second array (N, parts - 1, nx,
-        nx + 2 nu) contains the Jacobians where each interval is divided into equal parts.
+        nx + 2 nu) contains the Jacobians at the points that divide each interval into equal parts.
         """
         # Runge-Kutta steps of dZ/dt = A Z + B along the motions; one array holds all intervals.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
