@@ -345,9 +345,9 @@ class Matrices(NamedTuple):
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
     """Return matrices that map inputs and the initial error to errors, z and limited values.
 
-    z is the scaled difference of the inputs from the regulator: ``d = L z - K e``. The matrices
-    have N nu + nx columns. The first N nu columns multiply z if `planned` is True, and d otherwise.
-    The last nx columns multiply the initial error.
+    z is the scaled difference between the inputs d and the inputs -K e of the regulator, so that
+    ``d = L z - K e``. The matrices have N nu + nx columns. The first N nu columns multiply z if
+    `planned` is True, and d otherwise. The last nx columns multiply the initial error.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)

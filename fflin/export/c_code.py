@@ -373,7 +373,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
-    """Return the words that the templates of a state law need in addition."""
+    """Return {placeholder: text} for the placeholders that only laws of states have."""
     n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
     words: dict[str, object] = {
         **{"joints": n, "joints_max": max(n, 1), "states": state.nx},

@@ -58,7 +58,7 @@ class Lanes(Type):
     """numba type of eight doubles in one vector; a double can stand for eight equal numbers."""
 
     def can_convert_from(self, _: TypingContext, other: Type) -> Conversion | None:
-        """Return that doubles convert to lanes."""
+        """Return the kind of conversion from a double to lanes, and None for other types."""
         return Conversion.promote if other == float64 else None
 
 
