@@ -317,6 +317,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
                     ready = pool.submit(int)
                 self._pools.append(pool)
             ready.result()
+            # Only the worker writes results. With this end of the pipe closed, reading ends if the
+            # worker dies while it sends a result, and does not wait forever for the rest.
+            pool._result_queue._writer.close()  # type: ignore[attr-defined]  # typeshed omits it
         except OSError as error:
             self._ended = f"no worker process can be started: {error}"
         except futures.BrokenExecutor:

@@ -1,5 +1,8 @@
 """Any rows through any job: drawn by a seed, on threads or workers, into a file that goes on."""
 
+import os
+import sys
+import textwrap
 from contextlib import closing
 
 import numpy as np
@@ -9,6 +12,7 @@ import fflin
 from fflin.batch.files import FileStore, MemoryStore, read_rows
 from fflin.batch.run import Execution, run_chunks
 from tests.support.messages import any_wording
+from tests.support.patience import finished
 
 COUNT, CHUNK = 50, 8
 ALONE = Execution(threads=1)
@@ -95,3 +99,35 @@ def test_in_memory_the_error_has_what_is_made_of_the_rest():
     error = caught.value
     assert error.failed == ((16, 24, "walk 20 has no end"),)
     assert np.array_equal(error.batch, np.r_[0:16, 24:50])
+
+
+# The worker sends the length of a result, and dies before it sends the result.
+DYING = """
+    import os, struct, sys
+    from fflin.base.errors import FflinError
+    from fflin.batch.run import OwnWorkers
+    def half():
+        frame = sys._getframe()
+        while "result_queue" not in frame.f_locals:
+            frame = frame.f_back
+        os.write(frame.f_locals["result_queue"]._writer.fileno(), struct.pack("!i", 1000))
+        os._exit(1)
+    if __name__ == "__main__":
+        with OwnWorkers(1) as workers:
+            try:
+                workers.submit(half).result()
+            except FflinError as error:
+                print(error)
+            print(workers.submit(int).result())
+"""
+
+
+@pytest.mark.process
+def test_a_worker_that_dies_while_it_sends_a_result_is_replaced(tmp_path):
+    script = tmp_path / "dying.py"
+    script.write_text(textwrap.dedent(DYING))
+    done = finished(
+        [sys.executable, script], capture_output=True, text=True, env=os.environ, check=True
+    )
+    assert "a worker process died" in done.stdout
+    assert done.stdout.splitlines()[-1] == "0"
