@@ -197,8 +197,9 @@ def check_all(
                 before = worst.setdefault((test, block), row)
                 if not row.error * before.tolerance <= before.error * row.tolerance:
                     worst[test, block] = row
-        condition = scaled_condition(inertia_matrix(robot, lin))
-        title = title or f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
+        if not title:
+            condition = scaled_condition(inertia_matrix(robot, lin))
+            title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
     title += "" if tolerance is None else f", each error at most {tolerance:.1e}"
     return Check(tuple(worst.values()), title)
 
