@@ -410,8 +410,8 @@ class Scales:
 
     def _sizes(self, v: Array) -> tuple[Array, float]:
         """Return the sizes (6, 6) of cancelling terms in each block of the scaled A, and in f0."""
-        # The base's linear velocity is reduced by _ROUNDING_FRACTION, because it causes only
-        # rounding errors in Pinocchio's derivatives.
+        # The base's linear velocity counts only as the fraction _ROUNDING_FRACTION, because it
+        # causes nothing but rounding errors in Pinocchio's derivatives.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
