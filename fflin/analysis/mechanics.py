@@ -160,7 +160,7 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     """Return the continuous model, or else `lin`; None if that is not a second-order system."""
     # The continuous model has this structure if the rates of the positions depend on the
     # velocities alone. The structure then also applies to a model sampled from it. A sampled model
-    # without its continuous model has this structure only if there are no forces.
+    # whose continuous model is unknown has this structure only if no forces act.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -312,7 +312,7 @@ def undecided(
 
 
 def shape(lin: LinearModel, at: Values) -> str:
-    """Describe a motion with rates `at` (nv,), real or complex, by its largest coordinates."""
+    """Describe a motion by its largest coordinates; `at` (nv,) has its rates, real or complex."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}

@@ -57,7 +57,10 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Read a file within `reading`; return its record, and whether its digest was verified."""
+    """Read a file; return its record, and whether its digest was verified.
+
+    Callers use `reading`, which converts the errors.
+    """
     # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
     # has no empty matrices.
     writing.check_ending(path, FORMATS)

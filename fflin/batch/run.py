@@ -222,7 +222,7 @@ def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
 @lru_cache(maxsize=4)
 def _unpickled(job: bytes) -> Job:
     """Return an unpickled job; a worker caches the job, so that it is prepared only once."""
-    with warnings.catch_warnings():
+    with _TURN, warnings.catch_warnings():  # one thread at a time, because threads share filters
         warnings.simplefilter("ignore")  # the caller has received these warnings
         result: Job = pickle.loads(job)
     return result

@@ -382,7 +382,7 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Policy that is bound to a robot by the function `bind`; `lin` is the model of its design."""
+    """Policy that the function `bind` binds to a robot; it was designed for the model `lin`."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None

@@ -493,7 +493,8 @@ def _indices(
         count = validation.whole("knots", knots, 1)
         chosen = both[np.linspace(0, len(both) - 1, count).round().astype(int)]
     else:
-        times = validation.vector("knots", knots, np.size(knots), "times of knots")
+        times = validation.as_double("knots", knots).ravel()
+        times = validation.vector("knots", times, times.size, "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
         raise InputError("knots is empty; give the number of knots, or a list of times [s]")

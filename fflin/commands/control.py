@@ -1,4 +1,4 @@
-"""Commands for controllers, simulations, C code, and many simulations or models."""
+"""Commands for controllers, C code and simulations, for campaigns, and for sweeps of models."""
 
 from __future__ import annotations
 

@@ -106,7 +106,10 @@ class OrbitField:
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the derivatives (nv, nv) of the forces of `wrenches` over q, base origin fixed."""
+        """Return the derivatives (nv, nv) over q of the generalised force that `wrenches` cause.
+
+        The origin of the base is fixed.
+        """
         # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body changes T
         # by T [t]x - [t]x T.
         model, (R, centers) = self.robot.model, self._bodies(data)

@@ -224,7 +224,7 @@ def at_parent(work, place, force):
 
 
 def move_bodies(work, tree, nu):
-    """Write velocities, and accelerations if c = 0, from the base outwards, for v_b = 0."""
+    """Write the velocities for v_b = 0, and the accelerations for c = 0, from the base outwards."""
     vec.clear(work, tree.motion, MOTION)
     vec.put3(work, tree.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):

@@ -293,8 +293,8 @@ class RunStatistics(
     """Statistics of the errors of eight runs, and the reference of these errors.
 
     - `law` computes states.
-    - Errors are relative to the state `x_ref` (nx,), whose attitude is in the point of `path`. With
-      a moving reference, they are relative to the rows `q_ref` and `nu_ref`.
+    - Errors are relative to the state `x_ref` (nx,). Its attitude is the quaternion in
+      `path.point.q`. With a moving reference, errors are relative to the rows `q_ref` and `nu_ref`.
     - `kind` (nx,) is the index of each state's kind, from 1 on. It is 0 for a state of no kind, and
       -1 for a state whose error is not recorded.
     - An error has settled when it stays below the fraction `settled` of its largest value, or below

@@ -197,8 +197,9 @@ def check_all(
                 before = worst.setdefault((test, block), row)
                 if not row.error * before.tolerance <= before.error * row.tolerance:
                     worst[test, block] = row
-        condition = scaled_condition(inertia_matrix(robot, lin))
-        title = title or f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
+        if not title:
+            condition = scaled_condition(inertia_matrix(robot, lin))
+            title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
     title += "" if tolerance is None else f", each error at most {tolerance:.1e}"
     return Check(tuple(worst.values()), title)
 
@@ -409,8 +410,8 @@ class Scales:
 
     def _sizes(self, v: Array) -> tuple[Array, float]:
         """Return the sizes (6, 6) of cancelling terms in each block of the scaled A, and in f0."""
-        # The base's linear velocity is reduced by _ROUNDING_FRACTION, because it causes only
-        # rounding errors in Pinocchio's derivatives.
+        # The base's linear velocity counts only as the fraction _ROUNDING_FRACTION, because it
+        # causes nothing but rounding errors in Pinocchio's derivatives.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):

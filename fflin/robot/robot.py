@@ -403,7 +403,7 @@ class Robot(Coordinates):
         """
         if found := next((joint for joint in self.joints if joint.name == name), None):
             return found
-        leader = {each.joint.name: each.leader.name for each in self.followers}.get(name)
+        leader = next((x.leader.name for x in self.followers if x.joint.name == name), "")
         if leader:
             raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")
         if name in (wheel for wheel, _ in named_wheels(self.inputs)):

@@ -158,7 +158,7 @@ def draft(robot: Robot, urdf: str) -> str:
 
 
 def _candidates(robot: Robot) -> tuple[str, list[str]]:
-    """Return inputs that link names suggest, as TOML comments, and the joints of likely wheels."""
+    """Return the inputs that the names of links suggest, as TOML comments, and likely wheels."""
     model, data = robot.model, robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())
     text, spun = "", []

@@ -114,8 +114,8 @@ class Plan:
         self.plant = plant = Plant(state, options.disturbance)
         self.policy: object = policy
         self.method = integrator(options.method)
-        along, (lin, _) = tracking_of(policy), feedback_of(policy)
-        follows = along.reference if along else None
+        (lin, _), follows = feedback_of(policy), getattr(decider(policy), "reference", None)
+        follows = follows if callable(follows) else None
         default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
         # Initial configuration (nq,) and velocity (nv,).
         self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)

@@ -189,6 +189,7 @@ def visualize(
     else:
         robot = _robot_of(robot, motion)
         start, end = float(motion.t[0]), float(motion.t[-1])
+        times = times if png is not None else None
         fps, speed, times = check_playback(fps, speed, times, start, end)
         goal = None if target is None else _configuration(robot, "target", target)
         page = Page(robot, motion.q[0], scene, tool, motion.frame)

@@ -62,6 +62,8 @@ def test_configuration_places_joints_and_base():
     joint = robot.joint("joint_2")
     assert q[joint.idx_q : joint.idx_q + 2] == pytest.approx([np.cos(4.0), np.sin(4.0)])
     assert (fflin.configuration(robot) == pin.neutral(robot.model)).all()
+    with pytest.raises(fflin.UnknownNameError, match="joint_2"):
+        robot.joint(["joint_2"])
 
 
 def test_locked_joints_are_welded():

@@ -321,6 +321,22 @@ def test_feedback_along_a_trajectory_brings_the_robot_back_to_it():
     assert apart[0] < 0.15 * apart[1]
 
 
+def test_a_policy_of_the_user_can_follow_a_reference():
+    robot = fflin.load("planar_detumble")
+    q, v = fflin.configuration(robot, {"joint_1": 0.2}), np.zeros(robot.nv)
+
+    class Following:
+        def reference(self, t):
+            return q, v, np.zeros(9)
+
+        def __call__(self, t, q, v):
+            return np.zeros(9)
+
+    motion = fflin.simulate(robot, Following(), duration=0.5)
+    assert (motion.q[0] == q).all() and motion.tracked
+    assert np.abs(motion.target - motion.x).max() < 1e-12
+
+
 def test_rows_are_kept_where_a_run_is_interrupted():
     robot = free_body((20.0, 30.0, 40.0))
 

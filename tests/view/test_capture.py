@@ -39,6 +39,12 @@ def test_pictures(robots, motion, tmp_path):
         fflin.visualize(robot, motion, png=strip, times=[9.0])
 
 
+def test_times_of_pictures_do_not_concern_a_page(robots, motion, tmp_path):
+    page = tmp_path / "m.html"
+    fflin.visualize(robots["planar_detumble"], motion, html=page, times=[9.0], open=False)
+    assert page.stat().st_size > 1000
+
+
 def test_along_a_trajectory_pictures_are_taken_all_the_way(robots, motion, tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: "")

@@ -262,7 +262,7 @@ class ModalMatrix:
 def second_order_loop(
     A: Array, B: Array, Q: Array, R_factor: Array
 ) -> tuple[ModalMatrix, Values] | None:
-    """Return a loop that is optimal if odd powers are neglected (10.5).
+    """Return a loop that is optimal if odd powers of its poles are neglected (10.5).
 
     The results are the modes V of the loop, and the cost V^H (Q + K' R K) V of its gain K. Return
     None if there is no such loop, for example because the model is not of second order.

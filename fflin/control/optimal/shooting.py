@@ -63,7 +63,7 @@ class Shooting:
         return integrate_rows(model, q, self.state.spread(difference)), v + self.state.spread(rates)
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
-        """Return the motions of the intervals from knots q, v under inputs u (N + 1, ..).
+        """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
 
         By default, each interval has the number of steps that `refine` found, but at least _STEPS.
         """
@@ -104,7 +104,7 @@ class Shooting:
         return values
 
     def inside(self, motions: Motions, parts: int) -> Array:
-        """Return limited values (N, parts, nx) at the ends of equal parts of each interval."""
+        """Return `limited_values` (N, parts, nx) at the ends of equal parts of each interval."""
         every = (motions[0].shape[1] - 1) // parts
         return self.limited_values(*(each[:, every::every] for each in motions))
 
