@@ -267,9 +267,11 @@ def require_fixed_point(lin: LinearModel) -> None:
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift
+    # Entries of equal size stay in order, although their last digits differ between processors.
+    sizes = [float(f"{size:.5g}") for size in np.abs(rate).tolist()]
     shown = [
         f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
-        for i in np.argsort(-np.abs(rate))
+        for i in np.argsort(-np.array(sizes), kind="stable")
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]
     advice = (
