@@ -374,7 +374,8 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Add the source of a part of a model.
 
-    The source is `lin`, or if `lin` is sampled, the same part of its continuous model.
+    The source is the whole model `lin`. If `lin` was sampled from a known continuous model, the
+    source is the corresponding part of the continuous model.
     """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)

@@ -287,7 +287,10 @@ class Dispersions:
         return {joint: properties(before[joint] + sum(x)) for joint, x in changed.items()}
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
-        """Return {part: values (N, n) of all joints} for dispersed stiffness and damping."""
+        """Return {"stiffness" or "damping": values (N, n) of all joints}.
+
+        A property that is not dispersed is omitted.
+        """
         found = dict[str, Array]()
         # A change of a mode's frequency does not change its damping ratio.
         frequency = 1.0 + self._of("frequency", drawn)

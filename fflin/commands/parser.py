@@ -83,7 +83,10 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE for one joint, or VALUE or urdf for all joints, which have the name None."""
+    """Read NAME=VALUE for one joint; for all joints, read VALUE or the word `urdf`.
+
+    For all joints, the returned name is None.
+    """
     if "=" in text:
         return assignment(text)
     return None, text if text == "urdf" else number(text)
@@ -371,7 +374,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
 
 
 def settle_former_names(arguments: argparse.Namespace) -> None:
-    """Accept the former names --step and --dt of --dt and --sample, with a warning."""
+    """Accept former names with a warning: --step is now --dt, and the former --dt is --sample."""
     if (step := getattr(arguments, "step", None)) is not None:
         said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:

@@ -181,8 +181,8 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     r"""Return the largest magnitude that the wrench of the inputs can have in every direction.
 
-    This is the largest r for which, for every unit vector d, inputs u within their limits satisfy
-    ``W u = r kept d``.
+    This is the largest r such that, for every unit vector d, there are inputs u within their limits
+    with ``W u = r kept d``. The columns of the matrix `kept` span the directions.
 
     The wrenches ``W u`` of inputs between `low` and `high` form a zonotope
     :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`.

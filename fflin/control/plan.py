@@ -199,7 +199,10 @@ class _Made(NamedTuple):
 
 
 def _least(search: Search) -> _Made:
-    """Return the plan of least effort, with the smallest limit violations of all attempts."""
+    """Search for a plan of least effort, and return the attempt with the smallest violations.
+
+    Attempts that reach the goal have priority.
+    """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)
     cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # the guess costs 1

@@ -134,8 +134,8 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    # A velocity that is constant in rotating axes (of the frame or the base) rotates with them.
-    # The skew terms are the derivatives over these rotations.
+    # A velocity that is constant in the axes of the frame or of the base rotates with these axes.
+    # The skew terms are its derivatives with respect to the rotation of the axes.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))

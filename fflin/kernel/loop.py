@@ -145,9 +145,10 @@ class Method(
 ):
     """Integration method: steps of h [s] with s stages.
 
-    - `shift`: rows with the weights of v and of the stages' accelerations in the displacement after
-      each stage. The last row is a second displacement after the last stage.
-    - `speed`: rows with the same weights for the velocity after each stage.
+    - `shift`: a row of weights for each stage. The displacement after the stage is the weighted sum
+      of v and the accelerations of the stages. The last row gives a second displacement after the
+      last stage.
+    - `speed`: a row of weights for each stage, which gives the velocity after it in the same way.
     - `origin`: the stage from whose configuration each displacement starts: 0 for the first stage,
       1 for the second.
     - `nodes` [s]: times of the stages.

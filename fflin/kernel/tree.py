@@ -96,7 +96,8 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
     """Convert the fields of a named tuple to the kinds of its struct.
 
     Return the converted tuple, its words, and a pair for each laned array: the array, and the
-    column of values that fills it. The arrays of the tuple must outlive the words.
+    column of values that fills it. The words contain the addresses of the
+    arrays of the converted tuple, which must therefore exist as long as the words are used.
     """
     parts: list[object] = []
     words: list[int] = []

@@ -44,7 +44,8 @@ _CAUSES = (
 # the largest rates, or until there are _MOST_STEPS steps.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Rounding errors: of positions, and of accelerations relative to the terms that they sum.
+# Relative rounding errors of a position and of an acceleration. The latter is relative to the terms
+# whose sum is the acceleration.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 

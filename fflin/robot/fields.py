@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from fflin.robot.robot import Robot
 
-# Least and largest value; a value without a limit is infinite.
+# Lower and upper limit; a missing limit is -inf or inf.
 Range: TypeAlias = tuple[float, float]
 
 RULES = ("urdf", "identity")

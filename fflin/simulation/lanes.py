@@ -190,8 +190,8 @@ class LaneLoop:
                     continue
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
-                # The loop would stop all lanes for a finished run. Its lane therefore continues as
-                # a copy of a running lane.
+                # The stop condition of a single lane stops the loop for all lanes. The lane of a
+                # finished run therefore continues as a copy of a running lane.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:

@@ -126,7 +126,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([not of.refusal(corner) for corner in corners])
-    # Draws come last, so that a search with more draws first repeats the search with fewer draws.
+    # Draws come last, so that a search with more draws begins as a search with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
@@ -274,7 +274,7 @@ def _safe(loops: Loops) -> float:
 
 
 def perron(Z: Array) -> Array:
-    """Return scalings d > 0 (.., n, 1) that reduce the norm of d Z / d.
+    """Return scalings d > 0 (.., n, 1) that reduce the norm of D Z D^-1, with D = diag(d).
 
     The scalings are computed from the left and right Perron vectors of |Z|.
     """
