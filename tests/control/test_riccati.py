@@ -7,12 +7,11 @@ import pytest
 import scipy.linalg as sl
 
 import fflin
-from fflin.control.optimal import riccati
 from fflin.control.optimal.riccati import (
     ModalMatrix,
     Riccati,
     _bilinear,
-    _refined,
+    _finished,
     half_size,
     second_order_loop,
     solve,
@@ -63,7 +62,7 @@ def compare_with_the_general_solution(equation, found, P, label):
     check = relative_residual(A, B, Q, R, found.P, None, dt)
     assert check <= 2.0 * relative_residual(A, B, Q, R, P, None, dt) + 1e-14, label
     # What they are off by, to first order, is what the two differ by.
-    F = A - B @ equation.trial(P).K
+    F = A - B @ equation.gain(P)
     lyapunov = sl.solve_discrete_lyapunov if dt else sl.solve_continuous_lyapunov
     own = 1e-13 * np.linalg.norm(P)
     for solution in (P, found.P):
@@ -153,7 +152,7 @@ def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(r
         U = np.linalg.solve(lin.B[m:], missing[m:])
         cost = V.conj().T @ Q @ V + U.conj().T @ R @ U
         assert own == pytest.approx(cost, rel=1e-6, abs=1e-9 * np.abs(cost).max())
-        residual = Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(modes.lyapunov(own)).residual
+        residual = Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(modes.lyapunov_modal(own)).residual
         assert (residual < 1e-11) == even
 
 
@@ -249,47 +248,39 @@ def test_inputs_whose_costs_are_far_apart_are_scaled_first(robots, dt, cross):
     assert found.residual < 1e-10
 
 
-def modes_of(F, discrete):
-    poles, V = np.linalg.eig(F)
-    return ModalMatrix(V, poles, discrete)
-
-
 def test_lyapunov_equations_by_modes(monkeypatch):
     rng = np.random.default_rng(17)
     F = rng.normal(size=(9, 9)) - 4.0 * np.eye(9)
     r = rng.normal(size=(9, 9))
     r += r.T
-    modes = modes_of(F, False)
-    assert modes.lyapunov(modes.V.conj().T @ r @ modes.V) == pytest.approx(
+    assert ModalMatrix.of(F, False).lyapunov(r) == pytest.approx(
         sl.solve_continuous_lyapunov(F.T, -r), rel=1e-10, abs=1e-12
     )
     F /= 1.2 * np.abs(np.linalg.eigvals(F)).max()
-    modes = modes_of(F, True)
-    assert modes.lyapunov(modes.V.conj().T @ r @ modes.V) == pytest.approx(
+    assert ModalMatrix.of(F, True).lyapunov(r) == pytest.approx(
         sl.solve_discrete_lyapunov(F.T, r), rel=1e-10, abs=1e-11
     )
     near = F + 1e-11 * rng.normal(size=F.shape)
     exact = np.sort_complex(np.linalg.eigvals(near))
     with monkeypatch.context() as patch:
         patch.setattr(np.linalg, "eigvals", None)  # they are read off
-        poles = modes_of(F, True).poles(near)
+        poles = ModalMatrix.of(F, True).poles(near)
         assert np.sort_complex(poles) == pytest.approx(exact, rel=1e-9)
         assert (np.sort_complex(poles.conj()) == np.sort_complex(poles)).all()
     far = F + 0.1 * rng.normal(size=F.shape)
     exact = np.sort_complex(np.linalg.eigvals(far))
-    assert np.sort_complex(modes_of(F, True).poles(far)) == pytest.approx(exact, rel=1e-9)
+    assert np.sort_complex(ModalMatrix.of(F, True).poles(far)) == pytest.approx(exact, rel=1e-9)
 
 
-def test_what_is_not_stable_is_no_solution(robots, monkeypatch):
-    monkeypatch.setattr(riccati, "_STEPS", 0)
+def test_what_is_not_stable_is_no_solution(robots):
     lin = fflin.linearize(robots["cubesat"])
     for model in (lin, lin.discretize(0.1)):
         equation = Riccati(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
         found = solve(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
-        assert _refined(equation, found.P, None, "general") is not None
-        assert _refined(equation, 0.0 * found.P, None, "general") is None
+        assert _finished(equation, equation.trial(found.P), None, "general") is not None
+        assert _finished(equation, equation.trial(0.0 * found.P), None, "general") is None
         if not model.dt:
-            assert _refined(equation, -found.P, None, "general") is None
+            assert _finished(equation, equation.trial(-found.P), None, "general") is None
 
 
 def test_critical_damping_is_solved_by_half_the_size():

@@ -8,7 +8,6 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_continuous_are, solve_discrete_are
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array, Values
@@ -59,11 +58,8 @@ def rates_of(poles: Values, dt: float) -> Values:
     return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
 
 
-class Trial(NamedTuple):
-    """P with its gain K, the residual matrix `defect`, and the relative norm of this matrix."""
-
+class _Trial(NamedTuple):
     P: Array
-    K: Array
     defect: Array
     residual: float
 
@@ -75,20 +71,28 @@ class Riccati:
     """
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
-        self.A, self.B, self.Q, self.R = A, B, Q, R
-        self.N = np.zeros_like(B) if N is None else N
+        N = None if N is None or not N.any() else N
+        self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
         # For a sampled system, A - I is used, because A' P A - P would lose accuracy by
         # cancellation.
         self.rate = A - np.eye(len(A)) if dt else A
+        self.R_factor, indefinite = dpotrf(R, lower=1)
+        self.definite = not indefinite
+        if not dt:
+            self._inputs = dtrtrs(self.R_factor, B.T, lower=1)[0]
+            self.cross = None if N is None else dtrtrs(self.R_factor, N.T, lower=1)[0]
 
-    def trial(self, P: Array) -> Trial:
-        """Return P with its gain and its residual."""
-        PB = P @ self.B
-        W, right = (self.R + self.B.T @ PB, PB.T @ self.A) if self.discrete else (self.R, PB.T)
-        factor = _cholesky(W)
-        Y = _lower(factor, right + self.N.T)
-        change, spent = P @ self.rate, Y.T @ Y
+    def gain(self, P: Array) -> Array:
+        """Return K (nu, nx), u = -K x."""
+        factor, Y = self._factored(P)
+        return dtrtrs(factor, Y, lower=1, trans=1)[0]
+
+    def trial(self, P: Array) -> _Trial:
+        """Return P, its residual matrix (`defect`), and the relative norm of this matrix."""
+        _, Y = self._factored(P)
+        change = P @ self.rate
+        spent = Y.T @ Y
         defect = change + change.T - spent + self.Q
         size = 2.0 * _norm(change) + _norm(spent) + _norm(self.Q)
         if self.discrete:
@@ -98,7 +102,23 @@ class Riccati:
         residual = _norm(defect) / max(size, _TINY)
         if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model overflow")
-        return Trial(P, dtrtrs(factor, Y, lower=1, trans=1)[0], defect, residual)
+        return _Trial(P, defect, residual)
+
+    def _factored(self, P: Array) -> tuple[Array, Array]:
+        """Return the Cholesky factor L of W, and Y = L' K with the gain K.
+
+        W is R in continuous time, and R + B' P B for a sampled system.
+        """
+        if not self.discrete:
+            Y = self._inputs @ P
+            return self.R_factor, Y if self.cross is None else Y + self.cross
+        PB = P @ self.B
+        W = self.R + self.B.T @ PB
+        factor, indefinite = dpotrf(0.5 * (W + W.T), lower=1)
+        if indefinite:
+            raise np.linalg.LinAlgError("R + B' P B is not positive definite")
+        right = PB.T @ self.A
+        return factor, dtrtrs(factor, right if self.N is None else right + self.N.T, lower=1)[0]
 
 
 def solve(
@@ -110,26 +130,21 @@ def solve(
     Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
-    found = _half_size(equation)
-    if found is not None and found.residual <= _SOUND:
-        return found
-    solver, unit = solve_discrete_are if dt else solve_continuous_are, np.eye(len(R))
-    # SciPy treats a badly scaled R as singular, so the inputs are then scaled so that R is I.
-    for factor, weight in ((unit, R), (_cholesky(R), unit)):
-        scaled, cross = (_lower(factor, x.T).T for x in (B, equation.N))
+    start = _half_size(equation)
+    if start is not None and start.residual <= _SOUND:
+        return start
+    found = [] if start is None else [start]
+    for unit in (False, True):
         # SciPy raises one of these errors if it cannot reorder the eigenvalues of the pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
-                P = solver(A, scaled, Q, weight, s=cross)
-            general = _refined(equation, 0.5 * (P + P.T), None, "general")
-            if general and (not found or general.residual < found.residual):
-                found = general
-        if found and found.residual <= _SOUND:
-            break
-    if found is None:
+            refined = _refined(equation, _general(equation, unit), None)
+            if (general := _finished(equation, *refined, "general")) is not None:
+                found.append(general)
+                if general.residual <= _SOUND:
+                    break
+    if not found:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
-    return found
+    return min(found, key=lambda solution: solution.residual)
 
 
 def half_size(
@@ -146,35 +161,39 @@ def half_size(
     return found if found.margin >= _NEAR_BOUNDARY * size else None
 
 
-def _half_size(equation: Riccati) -> Solution | None:
+def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
+    """Solve by the half-size method, with rows and columns of Q for rates scaled by 1 + `apart`."""
     found = None
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+        source = _bilinear(equation) if equation.discrete else equation
+        if source is None:
+            return None
+        A, Q, cross = source.A, source.Q, source.cross
+        if cross is not None:
+            # The substitution u + R^-1 N' x for the input removes the cross term from the cost.
+            A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
+            Q = Q - cross.T @ cross
+        scale = np.ones(len(A))
+        scale[len(A) // 2 :] += apart
+        Q = scale[:, None] * Q * scale
+        loop = second_order_loop(A, source.B, Q, source.R_factor)
+        if loop is None:
+            return None
+        modes, cost = loop
+        P = modes.lyapunov_modal(cost)
+        refined = _refined(equation, P, None if equation.discrete else modes)
+        found = _finished(equation, *refined, "structured")
+    if apart or (found is not None and found.residual <= _SOUND):
+        return found
     # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
-    # method then starts from a slightly different loop: Q is scaled for the rates.
-    for apart in (0.0, _APART):
-        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-            source = _bilinear(equation) if equation.discrete else equation
-            A, Q, factor = source.A, source.Q, _cholesky(source.R)
-            if source.N.any():
-                # The substitution u + R^-1 N' x for the input removes the cross term from the cost.
-                cross = _lower(factor, source.N.T)
-                A = A - source.B @ dtrtrs(factor, cross, lower=1, trans=1)[0]
-                Q = Q - cross.T @ cross
-            scale = np.ones(len(A))
-            scale[len(A) // 2 :] += apart
-            loop = second_order_loop(A, source.B, scale[:, None] * Q * scale, factor)
-            if loop is None:
-                break
-            modes, cost = loop
-            near = None if equation.discrete else modes
-            found = _refined(equation, modes.lyapunov(cost), near, "structured") or found
-        if found is not None and found.residual <= _SOUND:
-            break
-    return found
+    # method then starts from a slightly different loop.
+    return _half_size(equation, _APART) or found
 
 
-def _bilinear(equation: Riccati) -> Riccati:
-    """Return the continuous equation with the same P as a sampled equation (10.6)."""
-    A, B, Q, N = equation.A, equation.B, equation.Q, equation.N
+def _bilinear(equation: Riccati) -> Riccati | None:
+    """Return the continuous equation with the same P as a sampled equation (10.6), or None."""
+    A, B, Q = equation.A, equation.B, equation.Q
+    N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
@@ -183,16 +202,24 @@ def _bilinear(equation: Riccati) -> Riccati:
     # method corrects the effect, because it uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
-    return Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
+    continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
+    return continuous if continuous.definite else None
+
+
+def _finished(
+    equation: Riccati, trial: _Trial, modes: ModalMatrix | None, method: str
+) -> Solution | None:
+    K = equation.gain(trial.P)
+    F = equation.A - equation.B @ K
+    poles = modes.poles(F) if modes else np.linalg.eigvals(F)
+    found = solved(trial.P, K, poles, trial.residual, method, discrete=equation.discrete)
+    return found if found.margin > 0.0 else None
 
 
 def _refined(
-    equation: Riccati, P: Array, modes: ModalMatrix | None, method: str
-) -> Solution | None:
-    """Refine P by Newton steps, and return it if it is stabilising.
-
-    `modes` are None, or belong to a loop near the loop of P.
-    """
+    equation: Riccati, P: Array, modes: ModalMatrix | None
+) -> tuple[_Trial, ModalMatrix | None]:
+    """Refine P by Newton steps; `modes` are None, or belong to a loop near the loop of P."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False
@@ -200,9 +227,9 @@ def _refined(
         if best.residual <= enough:
             break
         if modes is None:
-            poles, V = np.linalg.eig(equation.A - equation.B @ trial.K)
-            modes, fresh = ModalMatrix(V, poles, equation.discrete), True
-        better = equation.trial(trial.P + modes.lyapunov(modes.V.conj().T @ trial.defect @ modes.V))
+            F = equation.A - equation.B @ equation.gain(trial.P)
+            modes, fresh = ModalMatrix.of(F, equation.discrete), True
+        better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution, a Newton step may improve P although the residual rises, so it is
         # accepted.
@@ -219,10 +246,26 @@ def _refined(
             if fresh and trial is not better:
                 break
             modes = None
-    F = equation.A - equation.B @ best.K
-    poles = modes.poles(F) if modes else np.linalg.eigvals(F)
-    found = solved(best.P, best.K, poles, best.residual, method, discrete=equation.discrete)
-    return found if found.margin > 0.0 else None
+    return best, modes
+
+
+def _general(equation: Riccati, unit: bool) -> Array:
+    """Solve with SciPy.
+
+    `unit` scales the inputs so that R is I, because SciPy treats a badly scaled R as singular.
+    """
+    from scipy.linalg import solve_continuous_are, solve_discrete_are
+
+    solver = solve_discrete_are if equation.discrete else solve_continuous_are
+    B, R, N = equation.B, equation.R, equation.N
+    if unit:
+        B = dtrtrs(equation.R_factor, B.T, lower=1)[0].T
+        N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+        R = np.eye(len(R))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
+        P: Array = solver(equation.A, B, equation.Q, R, s=N)
+    return 0.5 * (P + P.T)
 
 
 def _norm(matrix: Array) -> float:
@@ -238,8 +281,18 @@ class ModalMatrix:
         across = poles.conj()[:, None]
         self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
 
-    def lyapunov(self, r: Values) -> Array:
-        """Solve F' D + D F = -s (discrete: F' D F - D = -s) for a symmetric s, from r = V^H s V."""
+    @classmethod
+    def of(cls, F: Array, discrete: bool) -> ModalMatrix:
+        """Compute the modes of a matrix."""
+        poles, V = np.linalg.eig(F)
+        return cls(V, poles, discrete)
+
+    def lyapunov(self, r: Array) -> Array:
+        """Solve F' D + D F = -r (discrete: F' D F - D = -r) for a symmetric r (n, n)."""
+        return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
+
+    def lyapunov_modal(self, r: Values) -> Array:
+        """Solve the equation of `lyapunov`, with r given as V^H r V."""
         # In modal coordinates, the factors solve the equation element by element.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
@@ -313,14 +366,6 @@ def second_order_loop(
         a = a - F @ motion[:m] - H @ motion[m:]
     cost = motion.conj().T @ weight @ motion + a.conj().T @ a
     return ModalMatrix(T @ motion, poles, discrete=False), cost
-
-
-def _cholesky(W: Array) -> Array:
-    """Return the lower Cholesky factor of W, which is R, or R + B' P B for a sampled system."""
-    factor, indefinite = dpotrf(W, lower=1)
-    if indefinite:
-        raise np.linalg.LinAlgError("R + B' P B is not positive definite")
-    return factor
 
 
 def _lower(factor: Array, right: Array) -> Array:
