@@ -332,7 +332,8 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         raise FflinError(self._ended)
 
 
-# Threads start workers one at a time, because `_starting` changes a module that all threads share.
+# Threads start workers and unpickle jobs one at a time, because both change what all threads share:
+# `_starting` a function of multiprocessing, and `_unpickled` the filters of warnings.
 _TURN = Lock()
 
 
