@@ -79,8 +79,8 @@ def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterato
     """Check the files of a command while the command runs.
 
     Raise `FileError` if the command would overwrite a file that it reads, or write two outputs to
-    one file. `inputs` are the input files known at the start; `read_file` and `remember` add further
-    files.
+    one file. `inputs` are the input files known at the start; `read_file` and `remember` add
+    further files.
     """
     check_distinct(*(outputs := list(outputs)))
     token = _of_command.set((set(outputs), set()))
