@@ -63,8 +63,8 @@ _ROUTE_SAFETY = 10.0
 _LOOSEST = 1e-2
 
 # The terms with the base's linear velocity cancel in exact arithmetic. Numerically, they leave
-# rounding errors of about 1e-16 of their size. Errors are therefore divided by a scale that includes
-# the fraction _ROUNDING_FRACTION of these terms. A larger fraction would hide errors of other terms.
+# rounding errors of about 1e-16 of their size. Errors are therefore divided by a scale that
+# includes this fraction of these terms. A larger fraction would hide errors of other terms.
 _ROUNDING_FRACTION = 1e-3
 
 
