@@ -23,8 +23,8 @@ _SIZE_LIMIT = 2**17
 # its number of dots.
 _DOTS_LIMIT = 1_000
 
-# Multi-line strings may contain lines that look like keys. One-line strings and comments are
-# matched too, because they may contain quotes.
+# Matches strings and comments. Multi-line strings may contain lines that look like keys. One-line
+# strings and comments are matched too, because a quote inside them does not begin a string.
 _TEXTS = re.compile(
     r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -58,7 +58,8 @@ class TomlFile:
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        # Multi-line strings are removed. One-line strings stay, because they may be quoted keys.
+        # Multi-line strings are replaced by line breaks, which keeps the line numbers. One-line
+        # strings stay, because they may be quoted keys.
         self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
         for key_path, value in _values(self.record):
             # Python refuses to convert very long integers to text, so a message could not show the
@@ -84,7 +85,7 @@ class TomlFile:
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Begin an error with the file, the line of the key that it names, and the prefix `of`."""
+        """Put the file, the line of the key that an error names, and `of` before its message."""
         try:
             yield
         except FflinError as error:
@@ -92,7 +93,7 @@ class TomlFile:
             raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the path of the first key, string or pattern of a table that a message names."""
+        """Return the path of the key in a table whose name, text or pattern a message quotes."""
         head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         found = re.findall(r"'([^']+)'| (\S+) is ", message)
@@ -123,7 +124,7 @@ def flat(table: object) -> object:
 
 
 def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:
-    """Yield (key path, value) for the values at any depth, except tables and arrays."""
+    """Yield (key path, value) for all values that are neither tables nor arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], object]] = [((), record)]
     while left:
         key_path, value = left.pop()
