@@ -69,7 +69,7 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Convert errors of a ``with`` block that reads a file to `FileError`."""
+    """Turn errors into `FileError` in a ``with`` block that reads a file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
