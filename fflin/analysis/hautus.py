@@ -176,9 +176,9 @@ def unobservable(
     Return None if the test is inconclusive, that is, if K or D is not symmetric, D is indefinite,
     sampling aliases two poles, or a pole is defective.
     """
-    # At the pole zero, a Jordan chain has at most two vectors, s and v. They satisfy K s = K v = D
-    # v = C_s v = 0 and C_s s + C_v v = 0. By symmetry, the uncontrollable motions are the
-    # unobservable motions of C_s = S^T, C_v = 0.
+    # A Jordan chain of the pole zero has at most two vectors, s and v. They satisfy K s = K v = D v
+    # = C_s v = 0 and C_s s + C_v v = 0. Because M, D and K are symmetric, the uncontrollable
+    # motions are the unobservable motions for C_s = S^T and C_v = 0.
     if not system.symmetric:
         return None
     starts, margin = system.poles

@@ -170,7 +170,8 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     """
     # A continuous model is a second-order system if the rates of the positions depend on the
     # velocities alone. A sampled model without a known continuous model is accepted only if no
-    # force depends on the state, because its matrices then have the same structure.
+    # force depends on the state, because its matrices then have the structure of a continuous
+    # model.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):

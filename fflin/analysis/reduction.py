@@ -253,7 +253,7 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the indices (k,) of wheels whose states do not affect the other states, in two arrays.
+    """Return two index arrays of wheels whose states do not affect the other states.
 
     The first array contains the wheels whose angle has no effect on the other states. The second
     array contains those wheels of the first array whose speed has no effect either.

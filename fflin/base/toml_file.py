@@ -79,7 +79,10 @@ class TomlFile:
         return self._lines.get(dotted, 1)
 
     def error(self, problem: FflinError | str, *key_path: str | int) -> FflinError:
-        """Build an error of the problem's type that names the file and the line of a key."""
+        """Build an error whose message begins with the file and the line of a key.
+
+        The error has the type of `problem`, or is an `InputError` if `problem` is a text.
+        """
         kind = type(problem) if isinstance(problem, FflinError) else InputError
         return kind(f"{self.path}:{self.line(*key_path)}: {problem}")
 
