@@ -416,7 +416,7 @@ class LinearModel(StateSpace):
 def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
-    # Replace the dots in names, because python-control reserves them for the syntax `system.signal`.
+    # Replace the dots in names, because python-control reserves dots for the form `system.signal`.
     states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
