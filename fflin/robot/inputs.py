@@ -28,8 +28,8 @@ class Input:
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
 
-    # Upper limit in UNIT: one number for all entries, or one number for each of the three entries of
-    # a torque or force on the base.
+    # Upper limit in UNIT: one number, or three numbers for the entries of a torque or force on the
+    # base.
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
     # Lower limit in UNIT; by default -max, or 0 for a thruster.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
