@@ -120,7 +120,7 @@ def __getattr__(name: str) -> object:
 
 
 def _untyped(function: object) -> None:
-    """Remove the types from the signature that `help` shows, because the docstring gives them."""
+    """Remove annotations from the signature that `help` shows; the docstring gives the types."""
     from inspect import Parameter, signature
 
     shown = signature(function)

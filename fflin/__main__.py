@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# `_signal` is built in, so a signal.py in the working folder cannot be imported in its place.
+# `_signal` is built into Python, so a signal.py in the working folder cannot replace it.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
@@ -40,8 +40,8 @@ def main() -> int:
 
 def listen() -> None:
     """Make Ctrl-C end the process even in a callback, where Python drops `KeyboardInterrupt`."""
-    # If the parent process started this one with SIGINT ignored, as a shell script starts its
-    # background commands, SIGINT must stay ignored.
+    # A shell script starts its background commands with SIGINT ignored. In such a command, SIGINT
+    # must stay ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _unraisable

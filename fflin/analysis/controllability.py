@@ -1,4 +1,4 @@
-"""Controllability of a linear model, and checks that a regulator or filter design can succeed."""
+"""Controllability of a linear model, and checks before the design of regulators and filters."""
 
 import warnings
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _LOOPS = (
 )
 
 # A singular value of the scaled Popov-Belevitch-Hautus matrix counts as zero if it is below this
-# fraction of the largest singular value. Rounding gives repeated eigenvalues relative errors of
+# fraction of the largest singular value. Repeated eigenvalues have relative rounding errors of
 # about this size.
 _RANK = 1e-7
 
@@ -179,7 +179,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = [combination(row, states, 1.0 / size[z]) for row in rows]
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, conserved.selected] = rows
-    # As names of the controllable states, prefer coordinates on which an input acts directly.
+    # Name the controllable states by coordinates on which an input acts directly, if possible.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
@@ -266,8 +266,8 @@ def _by_second_order(
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed
-    # Without damping, each row gives the amplitude, or its rate, of a vibration or an instability
-    # that no input drives.
+    # Without damping, each row gives the modal coordinate, or its rate, of a vibration or an
+    # instability that no input drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, of_pole in shapes:
@@ -353,7 +353,7 @@ def _conclude(
 def _root(W: Array) -> Array:
     """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
     # The condition number of L is the square root of the condition number of W, so the rank of L is
-    # easier to decide.
+    # easier to decide than the rank of W.
     size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
@@ -408,7 +408,7 @@ def _reached(
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Return the names of the states with the largest entries in vectors (k, nx)."""
+    """Name the states with the largest entries in vectors (k, nx), for a message."""
     sizes = np.abs(vectors)
     large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
     words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)

@@ -13,16 +13,17 @@ from fflin.analysis import ranks
 from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
-# Singular values are computed only at suspicious eigenvalues. An eigenvalue is suspicious in two
-# cases: the product of its left eigenvector and the input matrix, whose columns have unit length,
-# is below _SUSPICIOUS, or another eigenvalue is closer than _SUSPICIOUS. The refinement of a pole
-# stops if the smallest singular value exceeds _SUSPICIOUS, because it is then certainly not zero.
+# Singular values are computed only at suspicious eigenvalues. An eigenvalue is suspicious if
+# another eigenvalue is closer than _SUSPICIOUS. It is also suspicious if the product of its left
+# eigenvector and the input matrix has a norm below _SUSPICIOUS, where the columns of the input
+# matrix have unit length. The refinement of a pole stops if the smallest singular value exceeds
+# _SUSPICIOUS, because it is then certainly not zero.
 _SUSPICIOUS = 1e-3
 
-# Refined poles closer than _SAME_POLE count as one pole, because rounding splits a multiple
-# eigenvalue and each part is refined. If two unobservable poles of a second-order system are closer
-# than _DEFECTIVE, they may be one defective pole. A defective pole has too few eigenvectors for the
-# test.
+# Rounding splits a multiple eigenvalue into several poles, which are refined separately. Refined
+# poles closer than _SAME_POLE therefore count as one pole. If two unobservable poles of a
+# second-order system are closer than _DEFECTIVE, they may be one defective pole. A defective pole
+# has too few eigenvectors for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
 # The Rayleigh quotient of a singular vector refines a pole. The refinement converges quadratically,
@@ -35,8 +36,9 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # model.
 _ALIASED = 1e-6
 
-# A pole whose decay rate in scaled time is below this may belong to a defective pair at zero.
-# Rounding moves such a pair by the square root of the rounding error.
+# A pole may belong to a defective pair at zero if its decay rate in scaled time is below this.
+# Rounding moves such a pair by the square root of the rounding error. For discrete-time poles z, 1
+# - |z| replaces the decay rate.
 _DECAY = 1e-7
 
 # If a motion decays to less than this fraction within one sample, only its rounding error remains.
@@ -117,7 +119,7 @@ def split_by_poles(
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
-    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to B.
+    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to the columns of B.
 
     The basis is real and orthonormal. The second result is the margin of the rank decisions.
     """
@@ -171,12 +173,12 @@ def unobservable(
       shapes (nv, m) of each pole;
     - the fixed poles.
 
-    Return None if the test is inconclusive: K or D is not symmetric, D is indefinite, sampling
-    aliases two poles, or a pole is defective.
+    Return None if the test is inconclusive, that is, if K or D is not symmetric, D is indefinite,
+    sampling aliases two poles, or a pole is defective.
     """
-    # At the pole zero, a Jordan chain has at most two vectors, s and v. They satisfy K s = K v = D
-    # v = C_s v = 0 and C_s s + C_v v = 0. By symmetry, the uncontrollable motions are the
-    # unobservable motions of C_s = S^T, C_v = 0.
+    # A Jordan chain of the pole zero has at most two vectors, s and v. They satisfy K s = K v = D v
+    # = C_s v = 0 and C_s s + C_v v = 0. Because M, D and K are symmetric, the uncontrollable
+    # motions are the unobservable motions for C_s = S^T and C_v = 0.
     if not system.symmetric:
         return None
     starts, margin = system.poles

@@ -15,19 +15,20 @@ from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
 
 # K or D counts as not symmetric if its relative asymmetry exceeds this. D counts as indefinite if
-# eigenvalues of both signs exceed this fraction of the largest one.
+# it has eigenvalues of both signs that exceed this fraction of the largest modulus.
 _SYMMETRIC = 1e-8
 
-# Largest error of L2 A = L1 in (9.2), relative to the largest entry of L1. If the error is larger,
-# the operating point is in motion, and the momenta are not the rates of any coordinates.
+# Largest residual of L2 A = L1 in (9.2) that counts as rounding, relative to the largest entry of
+# L1. If the residual is larger, the operating point is in motion, and the momenta are not the rates
+# of any coordinates.
 _CONSISTENT = 1e-8
 
 # A spin leaves rounding errors in K and D. In units of energy, the error of K is this number times
 # the squared spin rate, and the error of D is this number times the spin rate.
 _OF_SPIN = 1e-15
 
-# Let r be the orbital rate divided by the frequency of the fastest vibration. Relative to the
-# stiffness of this vibration, orbital effects have the size r^2. If r is below _SLOWEST, r^2 is
+# Let r be the orbital rate divided by the frequency of the fastest vibration. In A, orbital effects
+# are about r^2 times as large as the stiffness of this vibration. If r is below _SLOWEST, r^2 is
 # close to rounding error.
 _SLOWEST = 3e-6
 
@@ -133,9 +134,9 @@ class SecondOrder:
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
     # Multiplication by M leaves rounding errors in entries on which no spring, damper or input
-    # acts. Entries below a threshold are therefore set to zero. In units of energy, the least
-    # threshold is the same for all entries of K, and the same for all entries of D. Each column of
-    # S has its own least threshold.
+    # acts. Entries below a threshold are therefore set to zero. In units of energy, the threshold
+    # is a fraction of the largest entry of K for springs, and of the largest entry of D for
+    # dampers. For inputs, it is a fraction of the norm of the column of S.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
@@ -152,7 +153,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # An entry of S counts as rounding error if it is small compared with the norm of its column.
+    # The norm of each column of S sets the threshold for its entries.
     each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
@@ -169,7 +170,8 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     """
     # A continuous model is a second-order system if the rates of the positions depend on the
     # velocities alone. A sampled model without a known continuous model is accepted only if no
-    # spring or damper acts, because its matrices then have the same structure.
+    # force depends on the state, because its matrices then have the structure of a continuous
+    # model.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -189,7 +191,10 @@ def rates_of_positions(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """Momenta that no input, spring or damper changes, and the coordinates without them."""
+    """Conserved momenta, and the coordinates that remain if these are removed.
+
+    A momentum is conserved if no input, spring or damper changes it.
+    """
 
     # W (k, nv): W M nu is conserved. W is in echelon form, so a row for the momentum of a single
     # coordinate is a unit vector.
@@ -222,7 +227,7 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     size = system.size
     pushes = ranks.stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = ranks.null_space(pushes, 1.0 / size, states=2)
-    # A column of W^T is a unit vector if the momentum belongs to a single coordinate.
+    # After this, a column of W^T is a unit vector if its momentum belongs to a single coordinate.
     basis, pivots = ranks.echelon(free, size)
     W = basis.T
     momenta = W @ lin.M
@@ -269,8 +274,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
         for i in (0, 1)
     )
-    # If the other coordinates are fixed, the inputs cannot move the named coordinate. They may move
-    # it together with the others, so the name states this condition.
+    # If the other coordinates are fixed, the inputs cannot move the named coordinate. The inputs
+    # may move it together with the others, so the name states this condition.
     of_joint = np.array([group == "qdot_m" for group, _ in rates])
     only_joints = of_joint[conserved.kept].all()
     of_base = not conserved.weights[:, of_joint].any()

@@ -220,8 +220,8 @@ class Modes:
     def _of_appendages(self) -> list[str]:
         """Return two tables for a robot with flexible appendages, or an empty list.
 
-        The first table compares the frequencies of the appendages with their link free and clamped.
-        The second table contains the effective masses.
+        The first table compares two frequencies of each mode: with the link that carries the
+        appendage free, and with this link clamped. The second table contains the effective masses.
         """
         robot = self.lin._robot
         if robot is None or not robot.modes:

@@ -12,8 +12,9 @@ from fflin.base.validation import Array, FrozenArrays, instance, positive
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# A pole may be a zero pole that rounding has moved, if its decay rate is below this fraction of the
-# largest modulus of a pole. For discrete-time poles z, 1 - |z| is compared with this value itself.
+# Smallest decay rate that counts as nonzero, as a fraction of the largest modulus of a pole. A
+# slower pole may be a zero pole that rounding has moved. For discrete-time poles z, this is the
+# smallest 1 - |z| that counts as nonzero.
 _DECAY = 1e-7
 
 

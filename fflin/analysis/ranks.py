@@ -12,7 +12,7 @@ from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
-# A coefficient of an echelon form below this, relative to the pivot 1, is rounding error.
+# A coefficient of an echelon form is rounding error if it is below this, relative to its pivot 1.
 _CLEAN = 1e-10
 
 # A tolerance is SAFETY times the rounding error. A singular value between LOST and CLEAR times its
@@ -52,9 +52,11 @@ class Margin(NamedTuple):
         return Margin(self.decisions + other.decisions)
 
     def transformed(self, change: Array | float, *, halved: bool = False) -> Margin:
-        """Return the margin with each singular vector v scaled or mapped by `change`.
+        """Return the margin in other coordinates, with transformed singular vectors.
 
-        If `halved`, v is the half of the singular vector, positions or rates, with the larger norm.
+        A singular vector v becomes ``change @ v`` if `change` is a matrix, and otherwise ``change *
+        v``. If `halved`, v is first replaced by its positions or its rates, whichever have the
+        larger norm.
         """
         moved = []
         for one in self.decisions:
@@ -64,9 +66,10 @@ class Margin(NamedTuple):
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
-        """Undecided ranks as tuples (ratio, singular vector, change of the number of states).
+        """Undecided ranks as tuples (ratio, singular vector, change).
 
-        The change is positive if more states would count, given the opposite rank decision.
+        If the rank is decided the other way, the number of controllable or observable states
+        changes by `change`.
         """
         counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
         left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
@@ -216,7 +219,7 @@ def echelon(
 ) -> tuple[Array, Indices]:
     """Return a basis (m, r) of the column space with I in its pivot rows, and the pivots (r,).
 
-    `weights` (m,) make the rows comparable. Rows that are true in `preferred` become pivots if
+    `weights` (m,) make the rows comparable. Rows for which `preferred` is true become pivots if
     possible.
     """
     from scipy.linalg import qr

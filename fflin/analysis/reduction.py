@@ -253,7 +253,7 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the indices (k,) of wheels whose states do not affect the other states, in two arrays.
+    """Return two index arrays of wheels whose states do not affect the other states.
 
     The first array contains the wheels whose angle has no effect on the other states. The second
     array contains those wheels of the first array whose speed has no effect either.
@@ -271,8 +271,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # Some combinations of inputs exert no net force at rest but change the wheel speeds. The number
-    # of wheels that are kept is the number of independent changes of this kind. By default, wheels
+    # Some combinations of inputs exert no net force at rest but change the wheel speeds. As many
+    # wheels are kept as wheel speeds can be changed independently in this way. By default, wheels
     # are kept only if inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
@@ -325,7 +325,7 @@ def rigid_forces(body: LinearModel) -> Noisy:
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
     """Remove coordinates with the indices `removed` (k,), and their rates, from a model (9.4).
 
-    This is exact for all motions of these coordinates, if they do not affect the other states.
+    The result is exact for all values of the removed states, if these do not affect other states.
     """
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
@@ -340,7 +340,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model with the named states and inertia M; keep outputs of these states only."""
+    """Return the model with the named states, inertia M, and only the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
@@ -377,7 +377,7 @@ def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Record the source of a reduced model: the model from which it inherits its certificate.
 
     The source of `part` is the whole model `lin`. If `lin` was sampled from a known continuous
-    model, the source is the part that `make` selects from the continuous model.
+    model, the source is the part that `make` forms from the continuous model.
     """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)

@@ -249,7 +249,7 @@ class FflinWarning(UserWarning):
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Put the text `where` before the message of every fflin error that is raised inside."""
+    """Put the text `where` before the message of every fflin error in a ``with`` block."""
     try:
         yield
     except FflinError as error:

@@ -31,11 +31,11 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of N runs, sorted by the distance at which each run starts.
+    """Return success statistics of N runs, in order of increasing initial displacement.
 
-    `failed` (N,) is true for each failed run, in order of increasing distance. The statistics are
-    the number of runs before the first failure, a lower bound on the success rate of runs that
-    start within the distance of these, and a confidence interval for the success rate of all runs.
+    `failed` (N,) is true for each failed run. The statistics are the number of runs before the
+    first failure, a lower bound on the success rate at the displacements of these runs, and a
+    confidence interval for the success rate of all runs.
     """
     count = len(failed)
     inside = int(failed.argmax()) if failed.any() else count
@@ -75,7 +75,7 @@ def mean(values: Array, confidence: float) -> Estimate:
 def rank_correlations(columns: Array, values: Array) -> Array:
     """Return Spearman's rank correlation (k,) of each column with `values`.
 
-    `columns` has the shape (N, k) and `values` the shape (N,). `values` may contain inf.
+    `columns` is an array (N, k). `values` is an array (N,), which may contain inf.
     """
     ranks = np.empty((len(values), columns.shape[1] + 1))
     for k, column in enumerate((*columns.T, values)):

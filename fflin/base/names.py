@@ -84,7 +84,10 @@ def stands_for_any(key: str, names: Sequence[str]) -> bool:
 
 
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
-    """Return {index of a name: value}; names override patterns, which override groups."""
+    """Return {index of a name: value} from {name, pattern or group: value}.
+
+    A name overrides a pattern, and a pattern overrides a group.
+    """
     found: dict[int, T] = {}
     groups = {*map(group_of, names)}
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):

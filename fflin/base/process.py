@@ -28,7 +28,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated duration of a computation before it starts, if at least 10 s."""
+        """Before a computation, print its estimated duration, if this is at least 10 s."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")

@@ -6,7 +6,7 @@ digest, the file was damaged or edited, and is refused. The formats store the di
 
 - .npz: the entry ``sha256`` is the digest of the other entries;
 - .json: the entry ``sha256`` is the digest of the text before it;
-- .mat: the text of the header contains the digest of everything after the header. The digest is
+- .mat: the text of the header contains the digest of everything after this text. The digest is
   compared before SciPy reads the file, because SciPy can crash on a damaged file.
 
 A file without a digest is read without this check. The result is then not ``verified``, and it is
@@ -69,7 +69,7 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Convert errors of a ``with`` block that reads a file to `FileError`."""
+    """Turn errors into `FileError` in a ``with`` block that reads a file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones

@@ -89,7 +89,8 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # Columns that do not fit into the terminal's width follow below, in blocks of nonzero rows.
+    # Columns that do not fit into the terminal's width follow below, in blocks that omit rows of
+    # zeros.
     label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):

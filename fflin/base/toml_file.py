@@ -79,13 +79,19 @@ class TomlFile:
         return self._lines.get(dotted, 1)
 
     def error(self, problem: FflinError | str, *key_path: str | int) -> FflinError:
-        """Build an error of the problem's type that names the file and the line of a key."""
+        """Build an error whose message begins with the file and the line of a key.
+
+        The error has the type of `problem`, or is an `InputError` if `problem` is a text.
+        """
         kind = type(problem) if isinstance(problem, FflinError) else InputError
         return kind(f"{self.path}:{self.line(*key_path)}: {problem}")
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Put the file, the line of the key that an error names, and `of` before its message."""
+        """Put a location and the prefix `of` before the message of an error in a ``with`` block.
+
+        The location is the file and the line of the key that the message names.
+        """
         try:
             yield
         except FflinError as error:
@@ -93,7 +99,11 @@ class TomlFile:
             raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the path of the key in a table whose name, text or pattern a message quotes."""
+        """Return the path of the key of `table` to which a message refers.
+
+        A message refers to a key by its name, by its value if this is a string, or by a name that
+        the key matches as a pattern. Return the path of `table` if there is no such key.
+        """
         head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         found = re.findall(r"'([^']+)'| (\S+) is ", message)

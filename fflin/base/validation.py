@@ -64,7 +64,7 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
 
 
 def number(name: str, value: Any) -> float:
-    """Return a finite float, or raise `InputError` with the given value."""
+    """Return a finite float, or raise `InputError` that shows the given value."""
     refuse_masked(name, value)
     if isinstance(value, bool | np.bool_ | str):
         raise InputError(f"{name} is {value!r}, expected a number")
@@ -103,7 +103,7 @@ def refuse_masked(name: str, value: object) -> None:
 
 
 def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str) -> T:
-    """Return a value of the expected type, or raise `InputError` with the given type."""
+    """Return a value of the expected type, or raise `InputError` that shows the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
     return value
@@ -115,7 +115,7 @@ def truth(name: str, value: object) -> bool:
 
 
 def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
-    """Return a whole number within limits, or raise `InputError` with the given value."""
+    """Return a whole number within limits, or raise `InputError` that shows the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
     if not least <= value <= largest:
