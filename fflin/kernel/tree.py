@@ -171,7 +171,7 @@ class Tree(
     - `row`, `depth` (6 + n,): the offset of each row, and the number of its entries before the
       diagonal.
     - `path`: the column of each entry.
-    - `common` (6 + n, 6 + n): for each two rows, the number of columns that they have in common.
+    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that both contain.
     - `target`, `share`: one value for each pair of a body and a body on its path to the base,
       including the body itself. `target` is the entry of M to which the pair contributes, and
       `share` is the factor of this contribution. After the pairs of a body, one further value
@@ -242,7 +242,7 @@ def batch_tree(robot: Robot) -> Tree | None:
             above = parent[above]
         target.append(row[coordinate[body]])
         share.append(factor[body])
-    # Count the coordinates that each two paths have in common.
+    # For each pair of paths, count the coordinates that both paths contain.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
     wrench_body: list[int] = []
