@@ -68,7 +68,7 @@ def require_same(
     Units are not compared if they are None. With `part`, the robot may have more signals.
     """
     robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
-    if part:
+    if part and names != tuple(others):
         others = {name: others[name] for name in names if name in others}
     if names == tuple(others) and units in (None, tuple(others.values())):
         return
