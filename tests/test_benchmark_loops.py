@@ -138,7 +138,7 @@ def without_peers(monkeypatch):
 def test_peers_that_are_not_there_are_named(find, monkeypatch):
     without_peers(monkeypatch)
     found, notes = find(made("cubesat"))
-    assert len(found) == (3 if find is loops.contenders else 0)
+    assert len(found) == (4 if find is loops.contenders else 0)
     assert [note.partition(":")[0] for note in notes] == ["MuJoCo", "Drake", "Basilisk"]
     assert all("not installed" in note for note in notes)
 

@@ -1,4 +1,4 @@
-"""Robot: a free-flyer root joint and n joints with one degree of freedom."""
+"""Robot: a free-flyer root joint and n joints with one degree of freedom each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) on joints with positions q_m (.., n) and rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers for positions q_m and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -241,7 +241,8 @@ class Robot(Coordinates):
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
         checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
-        # With `merged`, joints that are not named keep their values. Otherwise, only modes do.
+        # If `merged`, all entries that are not named keep their values. Otherwise, only the entries
+        # of modes do.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
             if key in checked:
@@ -337,7 +338,8 @@ class Robot(Coordinates):
         changed: Robot = equipped(self, other)
         if not self.modes:
             return changed
-        # Keep the joints of the modes, so that the modal amplitudes keep their meaning in q.
+        # `changed` has new joints for the modes. Use the old joints instead, so that the modal
+        # amplitudes in q have the same meaning as before.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
@@ -425,5 +427,5 @@ class Robot(Coordinates):
 
     @property
     def _bare(self) -> Robot:
-        """The robot without joints of wheels and modes; the robot itself if it has none."""
+        """The robot without the joints of wheels and modes; `self` if it has no such joints."""
         return self._unequipped or self
