@@ -363,7 +363,7 @@ class Campaign(FrozenArrays):
         write_atomically({target: CODECS[".mat"][0](table, True)})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write the campaign, and strings such as the digest that identifies the call."""
+        """Write the campaign and additional strings, such as the digest of the call, to a file."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})

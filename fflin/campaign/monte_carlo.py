@@ -1,4 +1,4 @@
-"""Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
+"""Monte Carlo simulation of a loop with random parameters, initial states and sensor errors."""
 
 import json
 import math
@@ -268,7 +268,10 @@ def _require_sendable(job: CampaignJob) -> None:
 
 
 def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
-    """Return the goals; each is evaluated on the empty campaign `none` to find invalid goals."""
+    """Return the goals, including `until`.
+
+    Each goal is evaluated on the empty campaign `none`, so that an invalid goal raises an error.
+    """
     listed = [given] if isinstance(given, str) else given
     goals: list[str] = [
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
@@ -280,7 +283,10 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign in a file that the same call wrote; raise an error for any other file."""
+    """Return the campaign in a file that this call wrote earlier, or None if there is no file.
+
+    Raise `FileError` if a different call wrote the file.
+    """
     if not path.is_file():
         return None
     with suppress(FileError), reading(path, "Campaign"):
@@ -293,7 +299,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 
 def _header(job: CampaignJob) -> dict[str, object]:
-    """Return the header of a campaign: all fields that are not arrays."""
+    """Return the fields of a campaign that are not arrays and follow from its job."""
     plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
     fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
     for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
@@ -320,7 +326,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
 
 
 def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
-    """Return a digest of the call and its drawn values, on which the result depends."""
+    """Return a digest of the data that determine the result: the call and its drawn values."""
     drawn = job.dispersions.drawn(0, min(runs, _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))
