@@ -121,8 +121,8 @@ class Allocation:
     The policy commands the inputs of the robot `design`, such as torque and force on the base. The
     thrusters and motors of the simulated robot then produce the generalised force that is closest
     to the commanded force, without negative thrust and without exceeding an input limit. The
-    distance between the two forces is the sum of squared differences between the accelerations that
-    they cause.
+    squared distance between the two forces is e^T M e. Here e is the difference between the
+    accelerations that the two forces cause, and M is the inertia of the robot.
 
     Parameters
     ----------
