@@ -12,6 +12,8 @@ identification, IEEE Robotics and Automation Letters 3(1), 2018).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import filterfalse
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,7 +51,7 @@ _ASYMMETRY = 1e-12
 
 def dynamic_parameters(model: pin.Model) -> bytes:
     """Return the mass properties of all bodies as bytes, for a hash of the robot."""
-    return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
+    return np.array([*map(pin.Inertia.toDynamicParameters, model.inertias.tolist())]).tobytes()
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
@@ -225,16 +227,15 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
-    sums = sums_of(pieces)
-    names = [*(name for name in pieces if name not in sums), *link_of]
+    names = [*filterfalse(robot.sums.__contains__, pieces), *link_of]
     found = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+    return list(dict.fromkeys(map(link_of.get, found, found)))
 
 
-def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
+def sums_of(robot: Robot) -> set[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
-    linked = {each.joint for each in pieces.values() if not each.whole}
-    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
+    linked = {each.joint for each in robot.pieces.values() if not each.whole}
+    return {name for name, each in robot.pieces.items() if each.whole and each.joint in linked}
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
@@ -262,12 +263,11 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     # with inertia, and moves no joint with armature. The test asks only whether a mass or moment is
     # zero. It does not use the value, because rounding errors could then hide such a motion.
     bodies = robot.model.inertias.tolist()[ROOT:]
-    moments = [np.linalg.eigh(body.inertia) for body in bodies]
-    if all(
-        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
-        for body, (values, _) in zip(bodies, moments, strict=True)
-    ):
+    masses = np.array([*map(attrgetter("mass"), bodies)])
+    values, axes = np.linalg.eigh([*map(attrgetter("inertia"), bodies)])
+    if (masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all():
         return ()
+    moments = [*zip(values, axes, strict=True)]
     # Mimic joints follow their leaders. Therefore v = columns @ nu, where nu is the velocity of the
     # base and of the independent joints.
     columns = np.eye(robot.nv)

@@ -249,11 +249,11 @@ def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
     Each entry is (index of the joint, angular momentum (3,) [N m s] in the axes of the joint).
     """
     stored: dict[int, Array] = {}
-    for _, wheel in named_wheels(robot.inputs):
-        if wheel.momentum:
+    for wheel in robot.inputs:
+        if isinstance(wheel, ReactionWheel) and wheel.momentum:
             joint, axis = carrier(robot.model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
-    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
+    return tuple(zip(stored, map(frozen, stored.values()), strict=True))
 
 
 def _mounted_wheels(
