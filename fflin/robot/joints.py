@@ -298,7 +298,7 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:
-    """Return the joint with an index; raise `ModelError` unless it has one degree of freedom."""
+    """Return joint `index` of a model; raise `ModelError` unless it has one degree of freedom."""
     joint, name = model.joints[index], model.names[index]
     kind = joint.shortname()
     if kind == "JointModelMimic":

@@ -40,8 +40,8 @@ _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 # links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message about motions without kinetic energy names the coordinates that are involved. The
-# component of such a coordinate in the motions, scaled to unit norm, exceeds this value.
+# A message about motions without kinetic energy names the coordinates that are involved. A
+# coordinate is involved if its component, in motions of unit norm, exceeds this value.
 _INVOLVED = 0.1
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
@@ -153,7 +153,10 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
 
 
 def properties(P: Array) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about these centres."""
+    """Return masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about these centres.
+
+    P (N, 4, 4) contains the pseudo-inertias.
+    """
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
     second = P[:, :3, :3] - mass[:, None, None] * com[:, :, None] * com[:, None]
@@ -273,7 +276,8 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
-    # If M is singular at two random configurations, it is almost surely singular at all of them.
+    # If M is singular at two random configurations, it is almost surely singular at every
+    # configuration.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -311,11 +315,11 @@ def require_inertia(robot: Robot) -> None:
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the matrix (k, nv) that maps v to all velocities that have kinetic energy.
+    """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
 
-    These are the velocities of joints with armature and of centres of mass, and the angular
-    velocities about principal axes with inertia. `moments` are the eigenvalues and eigenvectors of
-    the inertias.
+    These are the rates of joints with armature, the velocities of centres of mass, and the angular
+    velocities about principal axes with inertia. `moments` contains the eigenvalues and
+    eigenvectors of each inertia.
     """
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)

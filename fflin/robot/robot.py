@@ -32,7 +32,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) of springs and dampers for positions q_m and rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers at joint positions and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
