@@ -5,8 +5,8 @@ from importlib import import_module
 from fflin.base import __version__
 
 # Public names, as {task: {module: names}}. Each name is imported at its first use (PEP 562), so
-# that a command without dynamics does not load Pinocchio. Type checkers read `__init__.pyi`, which
-# lists the same names and modules.
+# that commands which compute no dynamics do not load Pinocchio. Type checkers read `__init__.pyi`,
+# which lists the same names and modules.
 _PUBLIC = {
     "Robots": {
         "robot.loading": "load from_model",
@@ -120,7 +120,7 @@ def __getattr__(name: str) -> object:
 
 
 def _untyped(function: object) -> None:
-    """Remove type annotations from the signature that `help` shows; the docstring gives types."""
+    """Remove annotations from the signature that `help` shows; the docstring gives the types."""
     from inspect import Parameter, signature
 
     shown = signature(function)

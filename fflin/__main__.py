@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# `_signal` is built in, so a signal.py in the working folder cannot be imported in its place.
+# `_signal` is built into Python, so a signal.py in the working folder cannot replace it.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import os
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Run the command that the arguments of this process give, and return its exit code."""
-    # `python -m fflin` puts the working folder first on the import path. It is removed before
-    # further imports, unless fflin itself is imported from there.
+    """Run the command that the command-line arguments name, and return its exit code."""
+    # `python -m fflin` puts the working folder first on the import path, where its files could
+    # replace other modules. The folder is removed from the path before further imports, unless
+    # fflin itself is imported from it.
     if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
@@ -38,15 +39,16 @@ def main() -> int:
 
 
 def listen() -> None:
-    """Make Ctrl-C end the process even in a callback, where `KeyboardInterrupt` would be lost."""
-    # If the parent process ignores SIGINT, as nohup does, this process must ignore it too.
+    """Make Ctrl-C end the process even in a callback, where Python drops `KeyboardInterrupt`."""
+    # A shell script starts its background commands with SIGINT ignored. In such a command, SIGINT
+    # must stay ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _unraisable
 
 
 def leave(reason: BaseException) -> NoReturn:
-    """Report in one line that the command was stopped; exit without waiting for threads."""
+    """Print in one line that the command was stopped, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         # The line is written in one call, so that the output of other processes cannot split it.

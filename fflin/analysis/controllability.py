@@ -1,4 +1,4 @@
-"""Controllability of a linear model, and errors about states that a design cannot reach."""
+"""Controllability of a linear model, and checks before the design of regulators and filters."""
 
 import warnings
 from collections.abc import Sequence
@@ -27,8 +27,9 @@ _LOOPS = (
     "joint amplitude e, although the linear model does not show it"
 )
 
-# Singular values of the scaled Popov-Belevitch-Hautus matrix count as zero if they are below this
-# fraction of the largest. Repeated eigenvalues have errors of this size.
+# A singular value of the scaled Popov-Belevitch-Hautus matrix counts as zero if it is below this
+# fraction of the largest singular value. Repeated eigenvalues have relative rounding errors of
+# about this size.
 _RANK = 1e-7
 
 
@@ -178,7 +179,7 @@ def controllability(lin: LinearModel) -> Controllability:
         names = [combination(row, states, 1.0 / size[z]) for row in rows]
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, conserved.selected] = rows
-    # When the controllable states are named, prefer coordinates on which an input acts directly.
+    # Name the controllable states by coordinates on which an input acts directly, if possible.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
     zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
@@ -224,11 +225,17 @@ def controllability(lin: LinearModel) -> Controllability:
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
 ) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
-    """Split the 2 r states that remain without the conserved momenta, for a model at rest.
+    """Find the controllable subspace of a model at rest, without its conserved momenta.
 
-    Return None if the test is inconclusive. Otherwise return five results: a basis (2 r, d) of the
-    controllable subspace; rows (2 r - d, 2 r) on which no input acts; the names of these rows, or
-    None if the caller must form them from the state names; the method; and the fixed poles.
+    The subspace is expressed in 2 r states: the r kept coordinates of `conserved` and their rates.
+    Return None if the model is not at rest or the test is inconclusive. Otherwise return five
+    results:
+
+    - a basis (2 r, d) of the controllable subspace;
+    - rows (2 r - d, 2 r): combinations of states on which no input acts;
+    - the names of these rows, or None if the caller must form the names from the state names;
+    - the name of the method;
+    - the fixed poles.
     """
     source, R = mechanics.at_rest(lin), conserved.rates
     if source is None:
@@ -236,7 +243,7 @@ def _by_second_order(
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # The inputs act on every momentum that is not conserved, so all remaining states are
+        # The inputs act on every momentum that is not conserved, so all 2 r states are
         # controllable.
         everything = np.eye(2 * r)
         return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
@@ -244,8 +251,8 @@ def _by_second_order(
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
-    # The system is symmetric. Each motion (s, v) that is unobservable from the output S^T s
-    # therefore gives a row: a combination of states on which no input acts.
+    # M, K and D are symmetric. Each motion (s, v) that is unobservable from the output S^T s
+    # therefore gives one row: a combination of states on which no input acts.
     motions, shapes, fixed = found
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
@@ -259,8 +266,8 @@ def _by_second_order(
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed
-    # Without damping, each row measures the position or the rate of a vibration that no input
-    # drives.
+    # Without damping, each row gives the modal coordinate, or its rate, of a vibration or an
+    # instability that no input drives.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, of_pole in shapes:
@@ -288,8 +295,8 @@ def require_stabilizable(lin: LinearModel) -> None:
         return _conclude(StabilizabilityError, *said)
     found, words = controllability(lin), ""
     if not found.stabilizable:
-        # Name the momenta and the other states, but not the coordinates whose rates are the
-        # momenta.
+        # The message names the momenta and the other uncontrollable states. It omits the
+        # coordinates whose rates are the momenta.
         count = len(mechanics.conserved(lin).weights)
         lost = (*found.uncontrollable[:count], *found.uncontrollable[2 * count :])
         words = missed.format(listed(mechanics.grouped(lost)))
@@ -319,7 +326,7 @@ def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
-    """Raise `InputError` if no disturbance excites a marginally stable mode."""
+    """Raise `InputError` if noise of intensity W leaves a marginally stable mode unexcited."""
     missed = (
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
@@ -330,7 +337,10 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 def _conclude(
     kind: type[FflinError], words: str, notes: Sequence[str], margin: ranks.Margin
 ) -> None:
-    """Raise an error with `words` and the undecided ranks, or only warn if `words` is empty."""
+    """Raise an error with the message `words` and the undecided ranks in `notes`.
+
+    If `words` is empty, warn about each undecided rank instead.
+    """
     doubts = [note for note in notes if note.startswith("undecided")]
     if words:
         error: Any = kind("; ".join((words, *doubts)))
@@ -343,7 +353,7 @@ def _conclude(
 def _root(W: Array) -> Array:
     """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
     # The condition number of L is the square root of the condition number of W, so the rank of L is
-    # easier to decide.
+    # easier to decide than the rank of W.
     size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
@@ -353,17 +363,18 @@ def _root(W: Array) -> Array:
 def _reached(
     lin: LinearModel, A: Array, B: Array, what: str, complaint: str, *, unstable: bool = False
 ) -> tuple[str, list[str], ranks.Margin]:
-    """Test whether B misses a mode of A on the stability boundary.
+    """Test whether the columns of B excite every mode of A on the stability boundary.
 
-    Return an error message, which is empty if no mode is missed, notes on undecided ranks, and the
-    margin. If `unstable`, modes beyond the boundary are tested as well.
+    If `unstable`, test the unstable modes as well. Return three results: an error message, or "" if
+    B excites all tested modes; notes on undecided ranks; and the margin of the rank decisions.
     """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
-    # rounding error. Poles closer than 1e-3 times the largest pole therefore count as equal.
+    # rounding error. Poles therefore count as equal if they are closer than 1e-3 times the largest
+    # modulus of a pole (of z - 1 for discrete-time poles z).
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & unstable
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
@@ -397,7 +408,7 @@ def _reached(
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the largest states of vectors (k, nx), at least one for each vector."""
+    """Name the states with the largest entries in vectors (k, nx), for a message."""
     sizes = np.abs(vectors)
     large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
     words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)

@@ -12,11 +12,11 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
-# Modes have the same frequency if their frequencies differ by less than this fraction.
+# Two frequencies count as equal if their relative difference is at most this.
 _EQUAL = 1e-9
 
-# Effective masses below this fraction of the total are rounding error. An effective mass is the
-# square of a singular value, so singular values are squared before they are compared with this
+# Effective masses and moments of inertia below this fraction of the total are rounding error. They
+# are squares of singular values, so singular values are squared before they are compared with this
 # limit.
 _ROUNDING = 1e-14
 
@@ -167,8 +167,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))
-    # Coordinates are scaled by the springs so that K is the identity. Low frequencies then have the
-    # same relative accuracy as high frequencies.
+    # The joint coordinates are scaled so that K is the identity. Low frequencies then keep their
+    # full relative accuracy.
     soft = 1.0 / np.sqrt(stiffness[springs - 6])
     M_mm = floating[6:, 6:] * np.outer(soft, soft)
     squares, vectors = np.linalg.eigh((M_mm + M_mm.T) / 2.0)
@@ -185,14 +185,18 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Combine modes of equal frequency in L (6, k) so that the first of them has the most mass."""
+    """Combine modes of equal frequency so that the first of them has the most effective mass.
+
+    The columns of L (6, k) are the participation factors of the modes.
+    """
     L, first = L.copy(), 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))
         group = L[:, first:last]
-        # Combine the modes so that as few of them as possible have mass. Then combine the modes
-        # without mass so that as few of them as possible have a moment of inertia.
+        # Combine the modes so that as few of them as possible have effective mass. Then combine the
+        # modes without effective mass so that as few of them as possible have an effective moment
+        # of inertia.
         for rows in (slice(0, 3), slice(3, 6)):
             _, sizes, turned = np.linalg.svd(group[rows])
             group[:] = group @ turned.T
@@ -203,7 +207,7 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
 
 def _cells(values: Array, total: Array) -> list[str]:
-    """Return each value with its percentage of the total, or dots if it is rounding error."""
+    """Format each value and its percentage of the total, or two dots for a rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
         seen = abs(value) > 1e2 * _ROUNDING * whole

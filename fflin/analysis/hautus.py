@@ -1,8 +1,8 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
-`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B].
-`unobservable` tests a second-order system by the null space of [p^2 M + p D + K; C_s + p C_v]. This
-test is less sensitive to rounding.
+`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B] at
+each pole s. `unobservable` tests a second-order system by the null space of [p^2 M + p D + K; C_s +
+p C_v] at each pole p. The second test is less sensitive to rounding.
 """
 
 from operator import itemgetter
@@ -13,31 +13,35 @@ from fflin.analysis import ranks
 from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
-# A singular value above _SUSPICIOUS counts as nonzero. Singular values are computed only for
-# suspicious eigenvectors. An eigenvector is suspicious in two cases: its product with the unit
-# input columns is below _SUSPICIOUS, or its eigenvalue is closer than _SUSPICIOUS to another
-# eigenvalue.
+# Singular values are computed only at suspicious eigenvalues. An eigenvalue is suspicious if
+# another eigenvalue is closer than _SUSPICIOUS. It is also suspicious if the product of its left
+# eigenvector and the input matrix has a norm below _SUSPICIOUS, where the columns of the input
+# matrix have unit length. The refinement of a pole stops if the smallest singular value exceeds
+# _SUSPICIOUS, because it is then certainly not zero.
 _SUSPICIOUS = 1e-3
 
-# Eigenvalues closer than _SAME_POLE count as equal, because rounding moves a defective eigenvalue
-# by the square root of the rounding error. Second-order poles closer than _DEFECTIVE count as
-# defective. A defective pole has too few eigenvectors for the test.
+# Rounding splits a multiple eigenvalue into several poles, which are refined separately. Refined
+# poles closer than _SAME_POLE therefore count as one pole. If two unobservable poles of a
+# second-order system are closer than _DEFECTIVE, they may be one defective pole. A defective pole
+# has too few eigenvectors for the test.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# The Rayleigh quotient of a singular vector refines a pole. It converges quadratically, so
-# _REFINEMENTS steps are enough. A second-order pole is refined in at most twice as many steps. Its
-# refinement stops if a step is larger than _NEAR times the pole.
+# The Rayleigh quotient of a singular vector refines a pole. The refinement converges quadratically,
+# so _REFINEMENTS steps are enough. A pole of a second-order system is refined in at most twice as
+# many steps. Its refinement also stops if a step is larger than _NEAR times the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
-# Two poles are aliased if they are apart but sampling brings them closer than this. A state that is
-# observable in the continuous model may then be unobservable in the sampled one.
+# Two poles are aliased if their difference times dt is closer than this to a nonzero multiple of 2
+# pi j. A state that is observable in the continuous model may then be unobservable in the sampled
+# model.
 _ALIASED = 1e-6
 
-# A pole whose decay rate is below this may belong to a defective pair at zero. Rounding moves such
-# a pair by the square root of the rounding error.
+# A pole may belong to a defective pair at zero if its decay rate in scaled time is below this.
+# Rounding moves such a pair by the square root of the rounding error. For discrete-time poles z, 1
+# - |z| replaces the decay rate.
 _DECAY = 1e-7
 
-# If one sample reduces a motion below this fraction, only its rounding error remains.
+# If a motion decays to less than this fraction within one sample, only its rounding error remains.
 _DEAD = 1e4 * ranks.EPS
 
 
@@ -46,14 +50,17 @@ def split_by_poles(
 ) -> tuple[Array, Array, Array, ranks.FixedPoles]:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
 
-    Return four results: a basis (nx, d) of the controllable subspace; its complement (nx, nx - d);
-    rows (nx - d, nx) on which no input acts; and the fixed poles. For a dual pair, the complement
-    is the unobservable subspace.
+    Return four results:
+
+    - a basis (nx, d) of the controllable subspace;
+    - a basis (nx, nx - d) of its complement, which is the unobservable subspace if `dual`;
+    - rows (nx - d, nx): combinations of states on which no input acts;
+    - the fixed poles.
     """
-    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
-    # The states are scaled to units of energy, x = to_x xi. Velocities are scaled to L^T nu with
-    # M = L L^T, so that |xi|^2 is twice the kinetic energy. Positions are scaled likewise and
-    # divided by the unit of time, which gives A a norm of about 1.
+    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. The states
+    # are scaled to units of energy, x = to_x xi. Velocities nu are scaled to L^T nu with M = L L^T,
+    # so that the squared length of L^T nu is twice the kinetic energy. Positions p are scaled to
+    # L^T N^-1 p with dp/dt = N nu, and divided by a unit of time that gives A a norm of about 1.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
@@ -68,7 +75,7 @@ def split_by_poles(
     unit = 1.0 / rate if rate > 0.0 else 1.0
     if dt:
         # If the sample time is the period of the only vibration, X contains rounding errors instead
-        # of forces. The unit of time derived from X would then be too long.
+        # of the spring forces. The unit of time derived from X would then be too long.
         unit = min(unit, 100.0 * dt)
     stretch = np.repeat((unit, 1.0), nv)
     to_x, from_x = to_x * stretch, from_x / stretch[:, None]
@@ -80,8 +87,8 @@ def split_by_poles(
     if dt:
         noise = max(noise, ranks.EPS * (unit / dt + float(np.linalg.norm(A, 2))))
     # Orthogonal transformations split off left null vectors until none remain. This also removes
-    # the whole chain of a defective eigenvalue. A staircase algorithm would carry the rounding
-    # error of an ill-conditioned step into the next step.
+    # the whole Jordan chain of a defective eigenvalue. A staircase algorithm is not used, because
+    # it would carry the rounding error of an ill-conditioned step into the next step.
     A, to = (A.T, to_x.T) if dual else (A, from_x)
     B = ranks.unit_columns(to @ drive)
     inside, margin = np.eye(2 * nv), ranks.Margin()
@@ -112,7 +119,7 @@ def split_by_poles(
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
-    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to B.
+    """Return a basis (m, k) of the left eigenvectors of A that are orthogonal to the columns of B.
 
     The basis is real and orthonormal. The second result is the margin of the rank decisions.
     """
@@ -146,8 +153,8 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
             continue
         known = np.append(known, at)
         parts = np.real(vectors) if single else np.hstack((vectors.real, vectors.imag))
-        # Poles that differ only by rounding error have the same vectors, so only new directions
-        # are added.
+        # Poles that differ only by rounding error have the same left vectors, so only new
+        # directions are added.
         new = parts - found @ (found.T @ parts)
         found = np.hstack((found, ranks.image(new, _SUSPICIOUS)[0]))
     return found, margin
@@ -158,15 +165,20 @@ def unobservable(
 ) -> tuple[Array, tuple[tuple[complex, Values], ...], ranks.FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
-    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p. Return
-    three results: a basis (2 nv, k) of these motions (s, ds/dt); the nonzero poles of the
-    continuous model, one of each conjugate pair, with their shapes (nv, m); and the fixed poles.
-    Return None if the test is inconclusive, because K or D is not symmetric, D is indefinite,
+    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p, where
+    C_s is `position` and C_v is `velocity`. Return three results:
+
+    - a basis (2 nv, k) of these motions (s, ds/dt);
+    - the nonzero poles of these motions in continuous time, one of each conjugate pair, with the
+      shapes (nv, m) of each pole;
+    - the fixed poles.
+
+    Return None if the test is inconclusive, that is, if K or D is not symmetric, D is indefinite,
     sampling aliases two poles, or a pole is defective.
     """
-    # At the pole zero, Jordan chains have at most two vectors, s and v. They satisfy
-    # K s = K v = D v = C_s v = 0 and C_s s + C_v v = 0.
-    # By symmetry, the uncontrollable motions are the unobservable motions of C_s = S^T, C_v = 0.
+    # A Jordan chain of the pole zero has at most two vectors, s and v. They satisfy K s = K v = D v
+    # = C_s v = 0 and C_s s + C_v v = 0. Because M, D and K are symmetric, the uncontrollable
+    # motions are the unobservable motions for C_s = S^T and C_v = 0.
     if not system.symmetric:
         return None
     starts, margin = system.poles
@@ -195,7 +207,8 @@ def unobservable(
         margin &= certain
         if not shapes.shape[1]:
             continue
-        # A pole must have as many independent eigenvectors as its multiplicity.
+        # If a pole has fewer independent eigenvectors than its multiplicity, the test is
+        # inconclusive.
         D, sizes = system.D.values, np.abs(shapes)
         change = shapes.T @ (2.0 * pole * system.M + D) @ shapes
         size = sizes.T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(D)) @ sizes
@@ -227,7 +240,7 @@ def unobservable(
 def _missed_shapes_at(
     system: SecondOrder, position: ranks.Noisy, velocity: ranks.Noisy, pole: complex
 ) -> tuple[Values, complex, ranks.Margin]:
-    """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the margin."""
+    """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the rank margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(2 * _REFINEMENTS):
         # Scale each row by the size of its terms, so that a slow mode keeps its accuracy next to a

@@ -1,4 +1,4 @@
-"""Linear models as mechanical systems M a + D v + K s = S u; conserved momenta and their names."""
+"""Linear models in the second-order form M a + D v + K s = S u, and their conserved momenta."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
 
-# Springs or dampers count as not symmetric if their relative asymmetry exceeds this.
+# K or D counts as not symmetric if its relative asymmetry exceeds this. D counts as indefinite if
+# it has eigenvalues of both signs that exceed this fraction of the largest modulus.
 _SYMMETRIC = 1e-8
 
-# If the relative residual of a momentum exceeds this, the operating point is in motion. The
-# momentum is then not the rate of any coordinate.
+# Largest residual of L2 A = L1 in (9.2) that counts as rounding, relative to the largest entry of
+# L1. If the residual is larger, the operating point is in motion, and the momenta are not the rates
+# of any coordinates.
 _CONSISTENT = 1e-8
 
-# Rounding error in units of energy: for springs, it is multiplied by the squared spin rate; for
-# dampers, by the spin rate.
+# A spin leaves rounding errors in K and D. In units of energy, the error of K is this number times
+# the squared spin rate, and the error of D is this number times the spin rate.
 _OF_SPIN = 1e-15
 
-# Orbital effects depend on the square of the orbital rate divided by the fastest vibration rate. If
-# this ratio is below _SLOWEST, its square is close to rounding error.
+# Let r be the orbital rate divided by the frequency of the fastest vibration. In A, orbital effects
+# are about r^2 times as large as the stiffness of this vibration. If r is below _SLOWEST, r^2 is
+# close to rounding error.
 _SLOWEST = 3e-6
 
 
@@ -43,7 +46,7 @@ def checked(lin: LinearModel) -> LinearModel:
     for name in "ABCD":
         if not np.isfinite(getattr(lin, name)).all():
             raise InputError(f"{name} of the model has entries that are not finite")
-    # Orbital effects may be within the rounding error of a fast vibration.
+    # Orbital effects may be smaller than the rounding error of a fast vibration.
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
@@ -63,7 +66,7 @@ def rate_matrix(lin: LinearModel) -> Array:
 
 
 def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
-    """Return the inertia of the kept coordinates with the others free: a Schur complement of M."""
+    """Return the inertia of coordinates `kept` if `others` move freely, a Schur complement of M."""
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
@@ -79,11 +82,11 @@ class SecondOrder:
 
     @cached_property
     def size(self) -> Array:
-        """Square roots (nv,) of the diagonal of M, which make forces and speeds comparable."""
+        """Square roots (nv,) of the diagonal of M, which scale forces and speeds to equal units."""
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system restricted to the motions R z; constraint forces do no work."""
+        """Return the system whose motions are constrained to s = R z by forces that do no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
@@ -105,7 +108,10 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Values, ranks.Margin]:
-        """Approximate nonzero poles, one of each conjugate pair, and the margin of the ranks."""
+        """Approximate nonzero poles, one of each conjugate pair.
+
+        The second item is the margin of the rank decisions on K and D.
+        """
         scale = 1.0 / self.size
         rigid, margin = ranks.null_space(ranks.stacked([[self.K], [self.D]]), scale)
         unloaded, other = ranks.null_space(self.K, scale)
@@ -127,26 +133,27 @@ class SecondOrder:
 
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
-    # The product with M leaves rounding errors in entries without a spring, damper or input, so
-    # entries below a threshold are set to zero. All springs share one threshold and all dampers
-    # another, in units of energy. Each input has its own threshold.
+    # Multiplication by M leaves rounding errors in entries on which no spring, damper or input
+    # acts. Entries below a threshold are therefore set to zero. In units of energy, the threshold
+    # is a fraction of the largest entry of K for springs, and of the largest entry of D for
+    # dampers. For inputs, it is a fraction of the norm of the column of S.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * ranks.EPS * np.abs(rates)
     if lin.dt:
-        # Every entry of a matrix exponential has the rounding error of the largest entry.
+        # Every entry of a matrix exponential has the rounding error of its largest entry.
         spread[:, : 2 * nv] += 4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
-    # Forces that balance during a spin leave rounding errors. The model may have no other force
-    # that gives a scale for these errors, so they are estimated from the spin rate.
+    # In a spin, forces that balance each other leave rounding errors in K and D. If no other forces
+    # act, K and D do not show the size of these errors, so it is estimated from the spin rate.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # To find rounding errors, each entry of S is compared with the norm of its own column.
+    # The norm of each column of S sets the threshold for its entries.
     each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
@@ -157,10 +164,14 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return the continuous model, or else `lin`; None if that is not a second-order system."""
-    # The continuous model has this structure if the rates of the positions depend on the
-    # velocities alone. The structure then also applies to a model sampled from it. A sampled model
-    # whose continuous model is unknown has this structure only if no forces act.
+    """Return the continuous model of `lin`, or `lin` itself if no continuous model is known.
+
+    Return None if the result would not be a second-order system.
+    """
+    # A continuous model is a second-order system if the rates of the positions depend on the
+    # velocities alone. A sampled model without a known continuous model is accepted only if no
+    # force depends on the state, because its matrices then have the structure of a continuous
+    # model.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -169,7 +180,10 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
 
 
 def rates_of_positions(X: Array) -> Array:
-    """Return N (nv, nv) with dp/dt = N nu, or the identity if sampling makes N ill-conditioned."""
+    """Return N (nv, nv) in dp/dt = N nu, for positions p and velocities nu.
+
+    If sampling makes N ill-conditioned, return the identity instead.
+    """
     nv = len(X) // 2
     N = X[:nv, nv:]
     return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
@@ -177,16 +191,20 @@ def rates_of_positions(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """Conserved momenta, which no input, spring or damper changes, and the kept coordinates."""
+    """Conserved momenta, and the coordinates that remain if these are removed.
 
-    # W (k, nv): W M nu is conserved. W is in echelon form, so the row for the momentum of a single
+    A momentum is conserved if no input, spring or damper changes it.
+    """
+
+    # W (k, nv): W M nu is conserved. W is in echelon form, so a row for the momentum of a single
     # coordinate is a unit vector.
     weights: Array
     # L1, L2 (k, nx) with L1 A = 0, L2 A = L1 and L1 B = L2 B = 0. For a sampled model, A is
     # replaced by (A - I)/dt.
     momenta: Array
     coordinates: Array
-    # (r,): kept coordinates. If L1 x = L2 x = 0, they and their rates determine all other states.
+    # (r,): indices of the kept coordinates. If L1 x = L2 x = 0, these coordinates and their rates
+    # determine all other states.
     kept: Indices
     T: Array  # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
     margin: ranks.Margin  # margin of the rank decision on r
@@ -209,11 +227,11 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     size = system.size
     pushes = ranks.stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = ranks.null_space(pushes, 1.0 / size, states=2)
-    # A column of W^T is a unit vector if the momentum belongs to a single coordinate.
+    # After this, a column of W^T is a unit vector if its momentum belongs to a single coordinate.
     basis, pivots = ranks.echelon(free, size)
     W = basis.T
     momenta = W @ lin.M
-    # Find the coordinates whose rates are the momenta.
+    # Find L2: the coordinates whose rates are the momenta.
     X11, X12 = X[:nv, :nv], X[:nv, nv:]
     if not X11.any():
         coordinates = np.linalg.solve(X12.T, momenta.T).T
@@ -236,8 +254,8 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     return ConservedMomenta(W, L1, L2, kept, T, margin)
 
 
-# For each group of velocities: name of the momentum, and name of the coordinate whose rate is the
-# momentum.
+# {group of velocities: (name of their momentum, name of the coordinate whose rate this momentum
+# is)}.
 _CONSERVED = {
     "omega_b": ("angular momentum", "base attitude"),
     "v_b": ("linear momentum", "base position"),
@@ -256,8 +274,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
         for i in (0, 1)
     )
-    # The inputs cannot move the named coordinate while the others are fixed, but they may move it
-    # together with the others.
+    # If the other coordinates are fixed, the inputs cannot move the named coordinate. The inputs
+    # may move it together with the others, so the name states this condition.
     of_joint = np.array([group == "qdot_m" for group, _ in rates])
     only_joints = of_joint[conserved.kept].all()
     of_base = not conserved.weights[:, of_joint].any()
@@ -296,7 +314,7 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 def undecided(
     lin: LinearModel, fixed: ranks.FixedPoles, what: str, count: int, settled: str = ""
 ) -> tuple[str, ...]:
-    """Return notes on undecided ranks, and on a slowest motion that may or may not decay."""
+    """Return notes on undecided ranks, and on the slowest motion if its decay is undecided."""
     ranks = [
         f"undecided: {shape(lin, at)} counts as {'' if change < 0 else 'not '}{what}, but the "
         f"test value is only {ratio:.1g} times its rounding error; {count} or {count + change} "
@@ -312,7 +330,10 @@ def undecided(
 
 
 def shape(lin: LinearModel, at: Values) -> str:
-    """Describe a motion by its largest coordinates; `at` (nv,) has its rates, real or complex."""
+    """Describe a motion by its largest coordinates.
+
+    `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
+    """
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}

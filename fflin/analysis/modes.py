@@ -21,7 +21,8 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 # With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
-# counts as zero. Modes below 3e-7 of the highest frequency are therefore rigid-body modes.
+# counts as zero. Modes below about 3e-7 times the highest frequency therefore count as rigid-body
+# modes.
 _NO_STIFFNESS = 1e-13
 
 
@@ -217,7 +218,11 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return tables of the appendage modes (link free, link clamped) and effective masses."""
+        """Return two tables for a robot with flexible appendages, or an empty list.
+
+        The first table compares two frequencies of each mode: with the link that carries the
+        appendage free, and with this link clamped. The second table contains the effective masses.
+        """
         robot = self.lin._robot
         if robot is None or not robot.modes:
             return []
@@ -296,8 +301,8 @@ def modes(lin: LinearModel) -> Modes:
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
-    # Input forces that cancel each other leave rounding errors in the derivatives. Derivatives of
-    # this size are set to zero.
+    # If the input forces u0 cancel each other, rounding errors remain in the position derivatives.
+    # Derivatives of this size are set to zero.
     A = lin.A.copy()
     by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
@@ -316,8 +321,8 @@ def modes(lin: LinearModel) -> Modes:
         shape = vector / weight
         left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
-        # A shape is scaled by its largest coordinate. If several coordinates are equal, such as
-        # those of symmetric panels, the shape is scaled by the first one.
+        # A shape is scaled by its largest coordinate. If several coordinates are equally large, as
+        # for symmetric panels, the shape is scaled by the first of them.
         positions = np.abs(shape[:nv])
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shape, margin = np.asarray(shape / shape[largest], complex), scaled_pole.real / error
@@ -337,7 +342,10 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """Name the bodies with at least 1 % of the energy, and add up the energy of the others."""
+    """List the bodies with at least 1 % of the energy, and add up the energy of the others.
+
+    The list is shortened until it fits into `room` characters.
+    """
     words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
     text = ""
     for count in range(len(words), 0, -1):
@@ -365,7 +373,8 @@ def energies_of(
     moved = shape[: len(shape) // 2]
     if isinstance(lin, ReducedModel):
         moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
-    # Displacements in base axes. In a mode, all velocities are the displacements times the pole.
+    # Displacements in base axes replace the velocities: in a mode, all velocities are the
+    # displacements times the pole.
     moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
     kinetic = np.zeros(len(names))
     for part in (moved.real, moved.imag):
@@ -387,12 +396,13 @@ def nonzero_eigenpairs(
     """Return (pole, eigenvector, rounding error) of each nonzero pole of A, and the nullity of A.
 
     A is repeatedly replaced by :math:`V_1^T A V_1`, where the columns of :math:`V_1` are
-    orthonormal and orthogonal to the null space of A. Each step removes zero eigenvalues only. The
+    orthonormal and orthogonal to the null space of A. Each step removes only zero eigenvalues. The
     steps end when A is nonsingular.
     """
     # Rounding moves the k zero eigenvalues of a Jordan block by the k-th root of the rounding
-    # error. Zeros are therefore removed before eigenvalues are computed. The caller scales A to
-    # comparable entries. Singular values below n times the tolerance count as zero.
+    # error. Zero eigenvalues are therefore removed before the others are computed. The caller
+    # scales A so that its entries are comparable. Singular values up to n times the tolerance count
+    # as zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
@@ -406,8 +416,8 @@ def nonzero_eigenpairs(
                 break
             complement = np.asarray(transposed[:rank].T)
         else:
-            # Columns that are exactly zero are removed directly, because a rotation would add
-            # rounding errors.
+            # Columns that are exactly zero are removed directly, because an orthogonal
+            # transformation would add rounding errors.
             complement = np.eye(len(A))[:, used]
         steps.append(A @ complement)
         A = complement.T @ steps[-1]
@@ -427,7 +437,7 @@ def nonzero_eigenpairs(
             # An eigenvector x of V_1^T A V_1 gives the eigenvector A V_1 x of A, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space
         x /= np.linalg.norm(x)  # noqa: PLW2901
-        # Slow modes lose accuracy in these steps; one inverse iteration restores it.
+        # Slow modes lose accuracy in these steps; one inverse iteration restores the accuracy.
         if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
             near = whole - (value + EPS * size) * np.eye(n)
             with suppress(np.linalg.LinAlgError):  # singular if the shift is an eigenvalue

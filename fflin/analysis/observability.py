@@ -12,8 +12,9 @@ from fflin.base.validation import Array, FrozenArrays, instance, positive
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.model import LinearModel
 
-# If a pole's decay rate divided by the fastest pole is below this, the pole may be a zero pole that
-# rounding has moved.
+# Smallest decay rate that counts as nonzero, as a fraction of the largest modulus of a pole. A
+# slower pole may be a zero pole that rounding has moved. For discrete-time poles z, this is the
+# smallest 1 - |z| that counts as nonzero.
 _DECAY = 1e-7
 
 
@@ -237,7 +238,7 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     steps = round(duration / dt)
     if not steps or abs(steps * dt - duration) > 1e-9 * duration:
         raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
-    # Sum A^k Q A^kT over k < steps by repeated doubling.
+    # Sum A^k Q (A^k)^T over k < steps by repeated doubling.
     total, power = np.zeros_like(Q), np.eye(len(A))
     while steps:
         if steps & 1:

@@ -12,21 +12,21 @@ from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
-# A coefficient of an echelon form below this, relative to the pivot 1, is rounding error.
+# A coefficient of an echelon form is rounding error if it is below this, relative to its pivot 1.
 _CLEAN = 1e-10
 
 # A tolerance is SAFETY times the rounding error. A singular value between LOST and CLEAR times its
 # tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# Forces are compared in units of energy. A force below a threshold, _FLOOR times the largest force
-# of the same kind, may be rounding error. A force below _ROUNDING times the threshold is set to
-# zero.
+# Forces are compared in units of energy. The threshold of a force is its rounding error, but at
+# least _FLOOR times the largest force of the same kind. A force below the threshold may be rounding
+# error. A force below _ROUNDING times the threshold is set to zero.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
 class Decision(NamedTuple):
-    """Singular value divided by its tolerance; it counts as nonzero if this ratio is above 1."""
+    """Singular value divided by its tolerance; a ratio above 1 counts as nonzero."""
 
     ratio: float
     at: Values  # singular vector
@@ -34,7 +34,7 @@ class Decision(NamedTuple):
 
 
 class Margin(NamedTuple):
-    """Margin of rank decisions: smallest value counted as nonzero, largest counted as zero."""
+    """Singular values closest to their tolerances, which show how certain rank decisions are."""
 
     decisions: tuple[Decision, ...] = ()
 
@@ -52,9 +52,11 @@ class Margin(NamedTuple):
         return Margin(self.decisions + other.decisions)
 
     def transformed(self, change: Array | float, *, halved: bool = False) -> Margin:
-        """Return the margin with transformed directions, ``change * v`` or ``change @ v``.
+        """Return the margin in other coordinates, with transformed singular vectors.
 
-        If `halved`, v is the larger half of the direction: its positions or its rates.
+        A singular vector v becomes ``change @ v`` if `change` is a matrix, and otherwise ``change *
+        v``. If `halved`, v is first replaced by its positions or its rates, whichever have the
+        larger norm.
         """
         moved = []
         for one in self.decisions:
@@ -64,7 +66,11 @@ class Margin(NamedTuple):
 
     @property
     def doubts(self) -> tuple[tuple[float, Values, int], ...]:
-        """Undecided ranks: ratio, direction, and how the number of states would change."""
+        """Undecided ranks as tuples (ratio, singular vector, change).
+
+        If the rank is decided the other way, the number of controllable or observable states
+        changes by `change`.
+        """
         counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
         left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
         return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
@@ -81,7 +87,7 @@ class FixedPoles(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RankAnalysis(FrozenArrays):
-    """Fields that `Controllability` and `Observability` share; see there."""
+    """Fields that `Controllability` and `Observability` share; these classes describe them."""
 
     dimension: int
     rows: Array
@@ -136,7 +142,10 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 
 
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Set entries that are rounding errors to zero; compare their sizes in units of energy."""
+    """Set entries that are rounding errors to zero; compare their sizes in units of energy.
+
+    The unit of entry (i, j) is ``rows[i] * columns[j]``.
+    """
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
@@ -148,7 +157,7 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
 def right_vectors(
     values: Values, noise: Array, states: int = 1
 ) -> tuple[Array, Values, int, Margin]:
-    """Return n singular values, right singular vectors (n, n), the rank, and its margin."""
+    """Return singular values (n,), right singular vectors (n, n), the rank, and its margin."""
     # Rows are scaled to unit length, so that a large row does not hide a small one. A row with a
     # large rounding error is scaled to a smaller length, so that it does not hide other rows.
     n = values.shape[1]
@@ -168,12 +177,12 @@ def right_vectors(
 
 
 def divisors(sizes: Array) -> Array:
-    """Replace sizes of 0 by 1, so that vectors of size 0 stay 0 if they are divided by them."""
+    """Replace sizes of 0 by 1, so that division by the result leaves a zero vector unchanged."""
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
-    """Return the margin of a rank from singular values divided by the tolerance."""
+    """Return the margin of a rank; `ratios` are singular values divided by their tolerance."""
     near = range(max(rank - 1, 0), min(rank + 1, len(ratios)))
     return Margin(tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near))
 
@@ -181,7 +190,7 @@ def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin
 def null_space(matrix: Noisy, scale: Array | float = 1.0, states: int = 1) -> tuple[Array, Margin]:
     """Return a basis (n, k) of the null space, and its margin; see `right_vectors`.
 
-    The basis is orthonormal in coordinates that `scale` (n,) multiplies.
+    The basis vectors are ``scale * y`` with orthonormal vectors y (n,).
     """
     scales = np.broadcast_to(scale, matrix.values.shape[1])
     values, noise = matrix.values * scales, matrix.noise * scales
@@ -199,7 +208,7 @@ def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
 
 
 def unit_columns(matrix: Array) -> Array:
-    """Scale columns to unit length; omit columns that depend on others within rounding error."""
+    """Scale columns to unit length; omit columns that are rounding errors of the largest column."""
     sizes = np.linalg.norm(matrix, axis=0)
     real = sizes > 1e2 * EPS * sizes.max(initial=0.0)
     return matrix[:, real] / sizes[real]
@@ -208,15 +217,19 @@ def unit_columns(matrix: Array) -> Array:
 def echelon(
     columns: Array, weights: Array, preferred: Array | None = None
 ) -> tuple[Array, Indices]:
-    """Return a basis (m, r) of the column space, whose pivot rows form I, and the pivots."""
+    """Return a basis (m, r) of the column space with I in its pivot rows, and the pivots (r,).
+
+    `weights` (m,) make the rows comparable. Rows for which `preferred` is true become pivots if
+    possible.
+    """
     from scipy.linalg import qr
 
     size = columns.shape[1]
     if not size:
         return columns.copy(), np.zeros(0, dtype=np.intp)
     weighted = np.linalg.qr(columns * weights[:, None])[0]
-    # Preferred rows are weighted by 1,000; a larger weight would cost accuracy through poor
-    # pivots.
+    # Preferred rows are weighted by 1,000. A larger weight could select pivots so small that the
+    # basis loses accuracy.
     graded = weighted if preferred is None else weighted * np.where(preferred, 1e3, 1.0)[:, None]
     pivots = np.sort(qr(graded.T, mode="r", pivoting=True)[1][:size])
     basis = np.linalg.solve(columns[pivots].T, columns.T).T

@@ -26,8 +26,7 @@ Part = TypeVar("Part", bound=LinearModel)
 # A value below this fraction of the largest value is rounding error.
 _ROUNDING = 1e-9
 
-# The part of f0 that the reduced state omits must be below this fraction of the largest entry of
-# f0.
+# The part of f0 outside the reduced model must be below this fraction of the largest entry of f0.
 _DRIFT = 1e-9
 
 
@@ -254,13 +253,13 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return two groups of wheels whose states do not affect the other states.
+    """Return two index arrays of wheels whose states do not affect the other states.
 
-    In the first group, the angle has no effect. The second group is the part of the first in which
-    the speed has no effect either.
+    The first array contains the wheels whose angle has no effect on the other states. The second
+    array contains those wheels of the first array whose speed has no effect either.
     """
-    # A wheel speed has an effect if the carrier rotates at the operating point or the wheel has
-    # friction.
+    # A wheel speed affects other states if the link that carries the wheel rotates at the operating
+    # point, or if the wheel has friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
@@ -273,8 +272,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
     # Some combinations of inputs exert no net force at rest but change the wheel speeds. As many
-    # wheels are kept as there are independent changes of this kind. By default, wheels are kept
-    # only if inputs other than the wheels can rotate the base.
+    # wheels are kept as wheel speeds can be changed independently in this way. By default, wheels
+    # are kept only if inputs other than the wheels can rotate the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -293,9 +292,9 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
     """Return the model of the regulated states, or `lin` itself if it has no wheels."""
-    # The model omits the `removed_wheels`, and the angles of all wheels whose angle has no effect.
-    # It may therefore have fewer positions than rates. It omits the base position if no input acts
-    # on it.
+    # The model omits the `removed_wheels`, and the angles of all wheels whose angle affects no
+    # other state. It may therefore have fewer positions than rates. The model also omits each
+    # coordinate of the base position on which no input acts.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
@@ -317,14 +316,17 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 
 
 def rigid_forces(body: LinearModel) -> Noisy:
-    """Return the input matrix (r, nu) of the rigid motions, on which no spring acts."""
+    """Return the input matrix (r, nu) of the r rigid motions, in which no spring is deflected."""
     system = mechanics.second_order(body)
     motions, _ = null_space(system.K.T, 1.0 / system.size)
     return system.S.after(motions.T)
 
 
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
-    """Remove coordinates (k,) and their rates from a model; exact for all their motions (9.4)."""
+    """Remove coordinates with the indices `removed` (k,), and their rates, from a model (9.4).
+
+    The result is exact for all values of the removed states, if these do not affect other states.
+    """
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = mechanics.floating_inertia(lin.M, kept, removed)
@@ -338,7 +340,7 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
-    """Return the model of the named states with inertia M, and the outputs that they determine."""
+    """Return the model with the named states, inertia M, and only the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
     values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
@@ -372,10 +374,10 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
-    """Add the source of a part of a model.
+    """Record the source of a reduced model: the model from which it inherits its certificate.
 
-    The source is the whole model `lin`. If `lin` was sampled from a known continuous model, the
-    source is the corresponding part of the continuous model.
+    The source of `part` is the whole model `lin`. If `lin` was sampled from a known continuous
+    model, the source is the part that `make` forms from the continuous model.
     """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)

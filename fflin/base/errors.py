@@ -11,7 +11,7 @@ from types import ModuleType
 # largest length of a message.
 _CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
-# Matches a line break before an indented line. Messages of other packages contain such breaks.
+# Matches a line break before an indented line. Messages of other packages contain such line breaks.
 _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 
 
@@ -249,7 +249,7 @@ class FflinWarning(UserWarning):
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Put the place `where` before the message of every fflin error that is raised inside."""
+    """Put the text `where` before the message of every fflin error in a ``with`` block."""
     try:
         yield
     except FflinError as error:

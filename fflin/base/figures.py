@@ -41,7 +41,7 @@ def letters_of(count: float, height: float) -> float:
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Give an axis a symmetric logarithmic scale if its nonzero magnitudes span a decade."""
+    """Give an axis a symmetric logarithmic scale if the magnitudes of `values` span a decade."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return

@@ -31,11 +31,11 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of N runs, sorted by increasing distance of their start.
+    """Return success statistics of N runs, in order of increasing initial displacement.
 
     `failed` (N,) is true for each failed run. The statistics are the number of runs before the
-    first failure, a lower bound on the success rate up to this distance, and a confidence interval
-    for the success rate of all runs.
+    first failure, a lower bound on the success rate at the displacements of these runs, and a
+    confidence interval for the success rate of all runs.
     """
     count = len(failed)
     inside = int(failed.argmax()) if failed.any() else count
@@ -45,7 +45,10 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile and its interval; an end is infinite if there are too few values."""
+    """Return the p-quantile with its confidence interval.
+
+    An end of the interval is infinite if there are too few values.
+    """
     from scipy.special import bdtr
 
     count = len(values)
@@ -58,7 +61,7 @@ def quantile(values: Array, p: float, confidence: float) -> Estimate:
 
 
 def mean(values: Array, confidence: float) -> Estimate:
-    """Return the mean and Student's t interval, which assumes a normal distribution."""
+    """Return the mean and its Student's t interval, which assumes normally distributed values."""
     from scipy.special import stdtrit
 
     count, middle = len(values), float(values.mean())
@@ -70,7 +73,10 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of each column (N, k) with values (N,), which may be inf."""
+    """Return Spearman's rank correlation (k,) of each column with `values`.
+
+    `columns` is an array (N, k). `values` is an array (N,), which may contain inf.
+    """
     ranks = np.empty((len(values), columns.shape[1] + 1))
     for k, column in enumerate((*columns.T, values)):
         # Equal values all get the mean of their ranks.

@@ -26,7 +26,7 @@ def input_keys(of: Any) -> tuple[str, ...]:
 
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the 12 + 2n states: first the configuration, then the velocity."""
+    """Return the names of the 12 + 2 n states for n joints: first positions, then velocities."""
     groups = dict(q_b="xyz", r_b="xyz", q_m=joints, omega_b="xyz", v_b="xyz", qdot_m=joints)
     return tuple(f"{group}.{name}" for group, names in groups.items() for name in names)
 
@@ -34,7 +34,8 @@ def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
 def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:
     """Return (first, last, group, units) for each run of consecutive names of one group.
 
-    Names without a group form a run if they have the same unit.
+    `first` and `last` are indices. Consecutive names without a group form a run if they have the
+    same unit.
     """
     found: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -50,7 +51,7 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """Return the indices of the names that match a key, such as ``tau_m.x``, ``tau_m`` or ``*x``.
 
-    The key is a name, a group, the entry of a name, or a pattern.
+    The key is a name, a group, the part of a name after its first dot, or a pattern.
     """
     if key in names:
         return [names.index(key)]
@@ -83,7 +84,10 @@ def stands_for_any(key: str, names: Sequence[str]) -> bool:
 
 
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
-    """Return {index of a name: value}; names override patterns, which override groups."""
+    """Return {index of a name: value} from {name, pattern or group: value}.
+
+    A name overrides a pattern, and a pattern overrides a group.
+    """
     found: dict[int, T] = {}
     groups = {*map(group_of, names)}
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
@@ -92,7 +96,7 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
 
 
 def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
-    """Return {velocity state: rate}; the keys of `values` are joints, states, groups, patterns."""
+    """Return {velocity state: rate}; `values` has joints, states, groups or patterns as keys."""
     names = state_keys(joints)[6 + len(joints) :]
     full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
     return {names[index]: value for index, value in by_name("velocity", full, names).items()}

@@ -28,7 +28,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated duration of a computation before it starts, unless below 10 s."""
+        """Before a computation, print its estimated duration, if this is at least 10 s."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
@@ -37,9 +37,9 @@ class Progress:
         print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
 
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
-        """Show that `done` of `total` steps are done, after the label `what`.
+        """Show the label `what`, and a bar for `done` of `total` steps.
 
-        A run of more than 20 s also shows `hint`.
+        After 20 s, also show `hint`.
         """
         self.done, self.total = done, total
         if self._shown:
@@ -62,7 +62,7 @@ class Progress:
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
-    """Return `sys.path` without the entries that refer to given folders, in any spelling."""
+    """Return `sys.path` without the entries that lead to the given folders."""
     return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
 
 
@@ -77,7 +77,7 @@ def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> 
 def in_one_thread(function: Callable[P, T]) -> Callable[P, T]:
     """Limit BLAS to one thread while a function runs.
 
-    With many small matrices, several threads only wait for each other.
+    For many small matrices, several threads are no faster, because they wait for each other.
     """
 
     @wraps(function)

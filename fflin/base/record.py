@@ -1,12 +1,12 @@
 """Records on disk, which consist of named arrays, strings, lists of strings, and numbers.
 
 Models, gains, schedules, filters and motions are saved as records. Any program that reads .npz,
-.mat or .json can read them. Each file contains a SHA-256 digest, so that a damaged or edited file
-is refused:
+.mat or .json can read them. Each file contains a SHA-256 digest. If the content does not match the
+digest, the file was damaged or edited, and is refused. The formats store the digest as follows:
 
 - .npz: the entry ``sha256`` is the digest of the other entries;
 - .json: the entry ``sha256`` is the digest of the text before it;
-- .mat: the text of the header contains the digest of everything after the header. The digest is
+- .mat: the text of the header contains the digest of everything after this text. The digest is
   compared before SciPy reads the file, because SciPy can crash on a damaged file.
 
 A file without a digest is read without this check. The result is then not ``verified``, and it is
@@ -45,7 +45,7 @@ _BLOCK = 2**22
 _LARGEST = 1e300
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
-# Matches what is left of a header with a digest after the header was damaged.
+# Matches the remains of a damaged header that contained a digest.
 _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
@@ -57,9 +57,9 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Read a file; return its record, and whether its digest was verified.
+    """Return the record of a file, and whether its digest was verified.
 
-    Callers use `reading`, which converts the errors.
+    Call it inside `reading`, which converts errors to `FileError`.
     """
     # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
     # has no empty matrices.
@@ -69,7 +69,7 @@ def read_record(path: Path) -> tuple[Record, bool]:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Convert errors that occur inside, while a file is read, to `FileError`."""
+    """Turn errors into `FileError` in a ``with`` block that reads a file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
@@ -115,10 +115,10 @@ def figures(value: object) -> dict[str, float]:
 
 
 def content_digest(entries: Mapping[str, object]) -> str:
-    """Return the SHA-256 of arrays or bytes with their names, types and shapes.
+    """Return the SHA-256 of named arrays or bytes, including their names, types and shapes.
 
-    All file formats with several parts use this digest. The bytes of a part are hashed in blocks of
-    4 MiB.
+    The formats .npz and HDF5 use this digest. The bytes of each entry are hashed in blocks of 4
+    MiB.
     """
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
@@ -146,7 +146,7 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with the number of its entries. If a damaged length field hides some of them,
+    # The archive ends with the number of its entries. If a damaged length field hides some entries,
     # fewer entries are read.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
@@ -271,7 +271,10 @@ class Design(Result):
 
     @classmethod
     def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
-        """Return a result with the fields `own`; others come from the first source with them."""
+        """Return a result with the fields `own`.
+
+        Each other field is copied from the first source that has it.
+        """
         names = [each.name for each in fields(cls) if each.init]
         for source in sources:
             own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own
@@ -290,7 +293,7 @@ class Design(Result):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Read a file as `load` does; `given` sets the fields that files do not contain."""
+        """Read a file as `load` does; `given` contains the fields that files do not store."""
         source, name = writing.as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)

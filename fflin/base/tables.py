@@ -26,7 +26,7 @@ def width() -> int:
 
 
 def folded(lines: Iterable[str]) -> str:
-    """Wrap lines to the terminal's width, but not at no-break spaces; indent continued lines."""
+    """Wrap lines to the terminal's width, but not at no-break spaces; indent continuation lines."""
     wrap = textwrap.TextWrapper(width(), subsequent_indent="  ", break_on_hyphens=False)
     return "\n".join(map(wrap.fill, lines)).replace("\u00a0", " ")
 
@@ -89,7 +89,8 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # Columns that do not fit into the width follow below, in blocks that show only nonzero rows.
+    # Columns that do not fit into the terminal's width follow below, in blocks that omit rows of
+    # zeros.
     label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):
@@ -110,9 +111,9 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def rounding(values: Array) -> Array:
-    """Estimate rounding errors as eps times the largest entry of the row or column.
+    """Estimate the rounding error of each entry of a matrix.
 
-    The smaller of the two estimates applies to each entry.
+    The estimate is eps times the largest entry in the row or in the column, whichever is smaller.
     """
     sizes = abs(values)
     by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]

@@ -23,8 +23,8 @@ _SIZE_LIMIT = 2**17
 # its number of dots.
 _DOTS_LIMIT = 1_000
 
-# Multi-line strings may contain lines that look like keys. One-line strings and comments are
-# matched too, because they may contain quotes.
+# Matches strings and comments. Multi-line strings may contain lines that look like keys. One-line
+# strings and comments are matched too, because a quote inside them does not begin a string.
 _TEXTS = re.compile(
     r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -58,7 +58,8 @@ class TomlFile:
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
-        # Multi-line strings are removed. One-line strings stay, because they may be quoted keys.
+        # Multi-line strings are replaced by line breaks, which keeps the line numbers. One-line
+        # strings stay, because they may be quoted keys.
         self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
         for key_path, value in _values(self.record):
             # Python refuses to convert very long integers to text, so a message could not show the
@@ -78,13 +79,19 @@ class TomlFile:
         return self._lines.get(dotted, 1)
 
     def error(self, problem: FflinError | str, *key_path: str | int) -> FflinError:
-        """Build an error of the problem's type that names the file and the line of a key."""
+        """Build an error whose message begins with the file and the line of a key.
+
+        The error has the type of `problem`, or is an `InputError` if `problem` is a text.
+        """
         kind = type(problem) if isinstance(problem, FflinError) else InputError
         return kind(f"{self.path}:{self.line(*key_path)}: {problem}")
 
     @contextmanager
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
-        """Begin an error with the file, the line of the key that it names, and the prefix `of`."""
+        """Put a location and the prefix `of` before the message of an error in a ``with`` block.
+
+        The location is the file and the line of the key that the message names.
+        """
         try:
             yield
         except FflinError as error:
@@ -92,7 +99,11 @@ class TomlFile:
             raise self.error(type(error)(f"{of}{error}"), *key_path) from None
 
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
-        """Return the path of the first key, string or pattern of a table that a message names."""
+        """Return the path of the key of `table` to which a message refers.
+
+        A message refers to a key by its name, by its value if this is a string, or by a name that
+        the key matches as a pattern. Return the path of `table` if there is no such key.
+        """
         head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
         found = re.findall(r"'([^']+)'| (\S+) is ", message)
@@ -123,7 +134,7 @@ def flat(table: object) -> object:
 
 
 def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:
-    """Yield (key path, value) for the values at any depth, except tables and arrays."""
+    """Yield (key path, value) for all values that are neither tables nor arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], object]] = [((), record)]
     while left:
         key_path, value = left.pop()

@@ -33,7 +33,7 @@ else:
 T = TypeVar("T")
 
 # Largest error of the squared length of a quaternion or (cos, sin) pair that counts as rounding.
-# The quaternion or pair is then renormalised. A larger error is an error in the input.
+# The quaternion or pair is then renormalised. A larger error counts as wrong input.
 NORM_TOLERANCE = 1e-6
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
@@ -44,7 +44,8 @@ DOUBLE = np.dtype(np.float64)
 
 def vector(name: str, value: object, size: int, of_what: str) -> Array:
     """Return a vector (size,) of finite native floats; a valid array is not copied."""
-    # Python's sum is faster than NumPy's for short vectors, and does not warn if it overflows.
+    # A finite sum shows that every entry is finite. Python's sum is faster than NumPy's for short
+    # vectors, and does not warn if it overflows.
     if type(value) is np.ndarray and value.dtype is DOUBLE and value.shape == (size,):
         array: Array = value
         if math.isfinite(sum(array.tolist())):
@@ -63,7 +64,7 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
 
 
 def number(name: str, value: Any) -> float:
-    """Return a finite float, or raise `InputError` with the given value."""
+    """Return a finite float, or raise `InputError` that shows the given value."""
     refuse_masked(name, value)
     if isinstance(value, bool | np.bool_ | str):
         raise InputError(f"{name} is {value!r}, expected a number")
@@ -86,7 +87,7 @@ def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
 
 
 def share(name: str, value: object) -> float:
-    """Return a fraction between 0 and 1, or raise `InputError`."""
+    """Return a fraction above 0 and below 1, or raise `InputError`."""
     found = number(name, value)
     if not 0.0 < found < 1.0:
         raise InputError(f"{name} is {found:g}, expected a fraction between 0 and 1")
@@ -102,19 +103,19 @@ def refuse_masked(name: str, value: object) -> None:
 
 
 def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str) -> T:
-    """Return a value of the expected type, or raise `InputError` with the given type."""
+    """Return a value of the expected type, or raise `InputError` that shows the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
     return value
 
 
 def truth(name: str, value: object) -> bool:
-    """Return a switch as a bool, or raise `InputError` if it is neither a bool nor an integer."""
+    """Return True or False, or raise `InputError` if the value is neither a bool nor an integer."""
     return bool(instance(name, value, (bool, np.bool_, int), "True or False"))
 
 
 def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
-    """Return a whole number within limits, or raise `InputError` with the given value."""
+    """Return a whole number within limits, or raise `InputError` that shows the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
     if not least <= value <= largest:
@@ -129,7 +130,7 @@ def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
 
 
 def untied(key: str, value: object) -> tuple[object, bool]:
-    """Return a range, and whether all names that match its key share one random value."""
+    """Return the range in `value`, and whether names that match `key` share one random value."""
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -183,7 +184,7 @@ def _as_array(name: str, value: object) -> NDArray[np.generic]:
 
 
 class FrozenArrays:
-    """Mixin for frozen dataclasses that replaces writeable arrays by read-only copies."""
+    """Mixin that replaces writeable arrays in a frozen dataclass by read-only copies."""
 
     def __post_init__(self) -> None:
         for name, value in [*vars(self).items()]:
@@ -204,7 +205,7 @@ class Result(FrozenArrays):
     verified: bool
 
     def __repr__(self) -> str:
-        """Return a title: the robot, the numbers of points and signals, and the accuracy."""
+        """Return a title with the robot, the numbers of points and signals, and the accuracy."""
         parts = [said(getattr(self, key)) for key, said in _TITLE.items() if hasattr(self, key)]
         return f"{type(self).__name__}({', '.join(parts)})"
 
@@ -216,8 +217,8 @@ class Result(FrozenArrays):
         return repr(self)
 
 
-# Parts of the title of a result: {attribute: function that returns its text}. A result's title
-# contains the attributes that the result has.
+# Parts of the title of a result, as {attribute: function that formats its value}. Attributes that a
+# result does not have are omitted from its title.
 _TITLE: dict[str, Callable[[Any], str]] = {
     "robot": "'{}'".format,
     "__len__": lambda count: f"{count()} points",

@@ -1,9 +1,9 @@
 """Atomic writing of files.
 
 - A file is written completely. If anything fails, the old file stays unchanged.
-- The target is a new name or a regular file. An old file keeps its mode. The mode of a new file
-  follows from the umask.
-- If the target is a symbolic link, the file at its end is written and the link stays.
+- The target is a new name or a regular file. An existing file keeps its permissions. The
+  permissions of a new file follow from the umask.
+- If the target is a symbolic link, the link stays and the file to which it leads is written.
 - A command never overwrites a file that it reads.
 """
 
@@ -20,7 +20,7 @@ from pathlib import Path
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
 
-# Similar names are not searched for in a folder with more names than this.
+# In a folder with at least this many names, no similar names are searched for.
 _MANY = 1000
 
 
@@ -76,9 +76,11 @@ def _failing(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
-    """Raise `FileError` if a command reads a file that it will write, or writes a file twice.
+    """Check the files of a command while the command runs.
 
-    `inputs` are the input files known at the start; `read_file` and `remember` add further ones.
+    Raise `FileError` if the command would overwrite a file that it reads, or write two outputs to
+    one file. `inputs` are the input files known at the start; `read_file` and `remember` add
+    further files.
     """
     check_distinct(*(outputs := list(outputs)))
     token = _of_command.set((set(outputs), set()))
@@ -140,7 +142,7 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 
 
 def install(temporary: Path, target: Path) -> None:
-    """Replace a target by the temporary file, which has the complete new content."""
+    """Replace a target by a temporary file that contains the complete new content."""
     real = followed_path(target)
     if real.exists():
         os.chmod(temporary, real.stat().st_mode & 0o777)
@@ -150,7 +152,10 @@ def install(temporary: Path, target: Path) -> None:
 
 
 def followed_path(target: Path) -> Path:
-    """Follow a target's links to a file; raise `FileError` if this file must not be written."""
+    """Return the file to which a target's links lead.
+
+    Raise `FileError` if this file cannot be written, or if the command reads it.
+    """
     real = Path(os.path.realpath(target))
     with _failing(target, "written"):
         try:
@@ -177,7 +182,7 @@ def check_output_path(target: Path) -> None:
 
 
 def check_distinct(*targets: Path | None) -> None:
-    """Raise `FileError` if two paths of outputs lead to the same file; ignore None."""
+    """Raise `FileError` if two output paths lead to the same file; skip paths that are None."""
     for first, target in combinations(filter(None, targets), 2):
         same = os.path.realpath(first) == os.path.realpath(target)
         if same or same_file(first, target):

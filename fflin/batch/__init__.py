@@ -1,8 +1,10 @@
 """Sweeps: linear models and gains at many points, on threads or worker processes.
 
-`run` applies a job to rows, chunk by chunk, on threads or worker processes. It saves the results in
-a store of `files`; after a crash, the same call resumes from this store. In a `sweep`, the rows are
-`configurations`, and the result is a `linear_batch`. `gains` designs regulators for its points.
+The module `run` applies a job to the rows of arrays, chunk by chunk, on threads or worker
+processes. It writes the results into a store of `files`. If the store is a file, the same call
+resumes from it after a crash. The module `sweep` linearises a robot in this way at the points of
+`configurations`. The result is a batch of models, see `linear_batch`. The module `gains` designs a
+regulator for each model of such a batch.
 
 Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

@@ -261,12 +261,13 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
 
 
 def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
-    """Return configurations of a robot: a corrected array (N, nq), or points that are generated.
+    """Check configurations of a robot, and return them: a new array, or points generated on demand.
 
-    The rows of the array satisfy `Robot.checked_configuration`.
+    The array (N, nq) contains corrected rows, which satisfy `Robot.checked_configuration`.
     """
     if isinstance(q, Grid | RandomConfigurations):
-        # The robot of the points can have other inputs or outputs, but must have equal joints.
+        # The points may be made for a robot with other inputs or outputs, but its joints must be
+        # equal.
         if q.robot.joints != robot.joints:
             raise InputError(
                 f"q was made for '{q.robot.name}', whose joints differ from the joints of "
@@ -303,10 +304,10 @@ def checked_rows(
     *,
     every: bool = False,
 ) -> Array:
-    """Return read-only rows (count, size) from such an array, or from one row for all points.
+    """Return read-only rows (count, size), given as such an array or as one row for all points.
 
-    The function `check` is called for each row with an entry that is not finite. If `every` is
-    true, it is called for all rows.
+    The function `check` must raise an error for an invalid row. It is called for each row with an
+    entry that is not finite, or for all rows if `every` is true.
     """
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))

@@ -1,8 +1,9 @@
-"""Arrays of many rows in memory, in .npz files, and in HDF5 files that are read on demand.
+"""Storage of arrays with many rows: memory, .npz files, and HDF5 files that are read on demand.
 
 An HDF5 file has one dataset per array, and two datasets of checksums. ``chunk_sha256`` contains the
 checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
-``sha256`` is one checksum of ``chunk_sha256`` and of all content without rows.
+``sha256`` contains the checksum of all other content: ``chunk_sha256``, ``chunk``, the constant
+arrays, and all strings except ``request``.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ if TYPE_CHECKING:
 
 FORMATS = (".npz", ".h5")
 
-# From this version on, HDF5 adds checksums to its own metadata. Without them, reading a damaged
-# file can crash the process.
+# From format version 1.8 on, HDF5 adds checksums to its own metadata. Without these checksums,
+# reading a damaged file can crash the process.
 CHECKED = ("v108", "v108")
 
 CHUNK_CHECKSUMS = f"chunk_{CHECKSUM}"
 _CHUNK_BYTES = 2**22
 
-# Space in an HDF5 file for names, constant arrays and checksums [bytes].
+# Disk space that is reserved in an HDF5 file for names, constant arrays and checksums [bytes].
 _OVERHEAD = 2**16
 
 
@@ -58,7 +59,10 @@ def is_constant(array: Array) -> bool:
 def write_rows(
     path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
 ) -> None:
-    """Write strings, and arrays of equal length, to a file; add checksums if `checksummed`."""
+    """Write `arrays`, which have equal numbers of rows, and the strings `texts` to a file.
+
+    If `checksummed`, the file also gets checksums.
+    """
     writing.check_ending(path, FORMATS)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
@@ -91,7 +95,7 @@ def _checksum(entries: Mapping[str, object]) -> NDArray[np.uint8]:
 
 
 def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uint8]:
-    """Return the SHA-256 digests (chunks, 32) of the chunks of rows."""
+    """Return the SHA-256 digest of each chunk of `chunk` rows, as an array (chunks, 32)."""
 
     def checksum(start: int) -> NDArray[np.uint8]:
         return _checksum({key: value[start : start + chunk] for key, value in varying.items()})
@@ -105,16 +109,17 @@ def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uin
 def file_checksum(
     texts: Mapping[str, str], chunk: int, checksums: object, constants: Mapping[str, Array]
 ) -> NDArray[np.uint8]:
-    """Return the SHA-256 digest (32,) of a file's content, including the digests of its chunks."""
+    """Return the SHA-256 digest (32,) of the strings, chunk size, chunk digests and constants."""
     return _checksum({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
 
 
 def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
-    """Return arrays, names of constant arrays, strings, and whether checksums were verified.
+    """Read a file; return its arrays, the names of its constant arrays, its strings, and a flag.
 
-    A constant array is stored without rows, because its value is the same at all points.
+    The flag is true if the checksums were verified. All rows of a constant array are the same, so
+    the file contains, and the function returns, a single row without the axis of the rows.
     """
     writing.check_ending(path, FORMATS)
     if path.suffix == ".npz":
@@ -183,7 +188,7 @@ class MemoryStore:
             ) from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Return False: chunks in memory are never finished before a run."""
+        """Return False, because no chunk in memory is finished before the run starts."""
         return False
 
     def read(self, stop: int) -> dict[str, Array]:
@@ -191,7 +196,7 @@ class MemoryStore:
         return self.view(0, stop, self.arrays)
 
     def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
-        """Return views of the chunk's rows of the named arrays, for the results of a job."""
+        """Return views {name: rows of a chunk}, into which a job writes its results."""
         return {key: self.arrays[key][start:stop] for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -288,7 +293,7 @@ class FileStore:
             return {key: self._file[key][:stop] for key in self._shapes}
 
     def view(self, start: int, stop: int, names: Iterable[str]) -> dict[str, Array]:
-        """Return uninitialised arrays for a chunk's results, which `write` copies to the file."""
+        """Return uninitialised arrays for a chunk's results; `write` copies them to the file."""
         return {key: np.empty((stop - start, *self._shapes[key])) for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
@@ -302,7 +307,7 @@ class FileStore:
             self._file.flush()
 
     def complete(self) -> dict[str, Array]:
-        """Add the checksum of the whole file, and return its arrays under its final name."""
+        """Add the checksum of the whole file, give it its final name, and return its arrays."""
         with self._reported():
             checksums = self._file[CHUNK_CHECKSUMS][:]
             self._file[CHECKSUM][:] = file_checksum(
@@ -310,7 +315,7 @@ class FileStore:
             )
             self._file.close()
             writing.install(self.part, self.path)
-        # This call has written or verified every chunk, so no checksum is verified again.
+        # The run has written or verified every chunk, so the checksums are not verified again.
         return read_rows(self.path, verify=False)[0]
 
     def discard(self) -> None:
@@ -319,12 +324,15 @@ class FileStore:
         self.part.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the unfinished file, so that another run can resume from it."""
+        """Close the unfinished file; a later run can resume from it."""
         self._file.close()
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Reserve disk space for a file, because HDF5 can crash the process if the disk is full."""
+    """Reserve `size` bytes of disk space for a file; if this fails, delete the file.
+
+    The space is reserved because HDF5 can crash the process if the disk is full.
+    """
     try:
         with path.open("ab") as file:
             if hasattr(os, "posix_fallocate"):
@@ -343,7 +351,7 @@ def _memory() -> float:
 
 
 def require_room(path: Path, size: int) -> None:
-    """Raise `FileError` if a file of this size [bytes] does not fit on the disk."""
+    """Raise `FileError` if less than `size` bytes of the disk are free."""
     if size > (free := shutil.disk_usage(path.parent).free):
         raise FileError(
             f"{path} needs {size / 1e6:,.1f} MB, but only {free / 1e6:,.1f} MB are free; free "
@@ -363,6 +371,9 @@ def output_path(out: str | Path) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Return the path NAME.part of an unfinished result, next to the target of a symbolic link."""
+    """Return the path NAME.part of an unfinished file.
+
+    If `path` is a symbolic link, NAME is the path of its target.
+    """
     real = Path(os.path.realpath(path)) if os.path.islink(path) else path
     return real.with_name(real.name + ".part")

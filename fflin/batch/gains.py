@@ -122,7 +122,7 @@ class GainBatch(Design):
     def _interpolator(self) -> RegularGridInterpolator:
         from scipy.interpolate import RegularGridInterpolator
 
-        # The interpolator needs the last joint to vary fastest, so the rows are sorted.
+        # Sort the rows, because the interpolator expects that the last joint varies fastest.
         order = np.lexsort(self.joint_positions.T[::-1])
         shape = [len(values) for values in self._axes.values()]
         K = self.K[order].reshape(*shape, *self.K.shape[1:])
@@ -169,8 +169,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     nv, nu = batch.B_lower.shape[1:]
     K: Array = np.empty((len(batch), nu, 2 * nv))
     residual, margin = np.empty((2, len(batch)))
-    # About points at rest, A and f0 are the same at all points. If f0 is also zero, the points are
-    # equilibria.
+    # If all points are at rest, the batch stores a single A and a single f0. If this f0 is zero,
+    # every point is an equilibrium.
     at_rest = is_constant(batch.A) and is_constant(batch.f0) and not batch.f0[0].any()
     direct = at_rest and nu >= nv
     for index, L in enumerate(batch.B_lower):

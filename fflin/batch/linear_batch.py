@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Placement of a free-flyer joint that coincides with the root frame: position and quaternion.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
-# Joint values count as equal if they differ by at most this [rad|m].
+# Largest difference between joint values that count as equal [rad|m].
 _SAME = 1e-9
 
 
@@ -107,7 +107,8 @@ class LinearBatch(validation.Result):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[tuple[int, int, float], ...]
-    # _x0 is None at rest, because x0 then follows from q. _y0 is None if the output is the state.
+    # _x0 is None if all points are at rest, because x0 then follows from q. _y0 is None if the
+    # output is the state.
     _x0: Array | None
     _y0: Array | None
     # _reference is None if the reference of each point is its own base pose. This pose follows from
@@ -115,7 +116,8 @@ class LinearBatch(validation.Result):
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Further fields of the models, which are the same at all points or computed from the robot.
+    # Further fields of each `LinearModel`: values that are the same at all points, and functions
+    # that compute a field from the robot when it is read.
     _asked: Mapping[str, object]
     verified: bool = True
 
@@ -288,7 +290,7 @@ class LinearBatch(validation.Result):
         return LinearBatch(**found, _asked=ready.common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
-        """Return {name: array} of all arrays; each array has one row per point."""
+        """Return {name: array} of all arrays of the batch; each array has one row per point."""
         held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
         return {key: value for key, value in held.items() if value is not None}
 
@@ -302,7 +304,7 @@ class LinearBatch(validation.Result):
     def _model(self, index: int) -> LinearModel:
         common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
-        # The row is copied from a file into memory, so that the model does not keep the file open.
+        # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()
         rows = {key.removeprefix("_"): np.asarray(array[index]) for key, array in arrays}
         lower, root = rows.pop("B_lower"), rows.pop("root")
@@ -323,7 +325,7 @@ class LinearBatch(validation.Result):
         return frozen(x0)
 
     def _positions(self, q: Array) -> Array:
-        """Return the angles and lengths (N, n) of the joints at configurations (N, nq)."""
+        """Return the joint positions q_m (N, n) [rad|m] at configurations q (N, nq)."""
         q_m = np.empty((len(q), len(self.columns)))
         for k, (first, second, scale) in enumerate(self.columns):
             at = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
@@ -331,9 +333,9 @@ class LinearBatch(validation.Result):
         return q_m
 
     def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Array, bool, Any]]:
-        """Return each joint in `joints`: its name in messages, its positions, and a given value.
+        """Return (label, positions (N,), flag, value) for each joint in {joint: value}.
 
-        The flag before the value is true for a continuous joint.
+        The label names the joint in messages. The flag is true for a continuous joint.
         """
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
@@ -355,7 +357,7 @@ TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in
 def _checked_fields(
     arrays: dict[str, Array], header: dict[str, Any], constant: list[str]
 ) -> dict[str, Any]:
-    """Return the fields of a batch from the content of its file, or raise `ValueError`."""
+    """Return the fields of a batch from its file; raise `ValueError` for a wrong shape or type."""
     count = int(header["points"])
     found: dict[str, Any] = dict.fromkeys(_OPTIONAL_ARRAYS)
     for key in (*_ARRAYS, *(arrays.keys() & set(_OPTIONAL_ARRAYS))):
@@ -377,7 +379,10 @@ def _checked_fields(
 
 
 def _apart(at: Array, turning: bool, value: float) -> Array:
-    """Return the distances (N,) of joint positions from `value`; of angles, the shorter arc."""
+    """Return the distances (N,) of the joint positions `at` from `value`.
+
+    If `turning`, the joint is continuous, and the distance is the shorter arc between two angles.
+    """
     distance = at - value
     if turning:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))

@@ -1,7 +1,7 @@
 """Run a job on chunks of rows, and save the results in a store that may contain finished chunks.
 
-Chunks run on threads of this process, on worker processes that the call starts, or on the workers
-of a given executor. The job defines what the rows and the results are.
+Chunks are computed by threads of this process, by worker processes that `Execution` starts, or by
+the workers of a given executor. The job defines the content of the rows and of the results.
 """
 
 from __future__ import annotations
@@ -29,37 +29,38 @@ from fflin.kernel.compiled import available_cores
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Largest number of submitted chunks per worker. With two, a worker never waits for its next chunk.
+# Largest number of submitted chunks per worker. With two, the next chunk of a worker is ready when
+# the worker finishes a chunk.
 _QUEUED = 2
 
-# Assumed number of workers of an executor that does not report the number.
+# Assumed number of workers if an executor does not report how many it has.
 _UNKNOWN_WORKERS = 16
 
 Progress: TypeAlias = Callable[[int, int], object]
 
-# Rows: {name: array}, arrays of equal length. RowsOf: function of `start` and `stop` that returns
-# rows start to stop - 1.
+# Rows: {name: array}; the arrays have equal numbers of rows. RowsOf: function f(start, stop) that
+# returns the rows start to stop - 1.
 Rows: TypeAlias = Mapping[str, Array]
 RowsOf: TypeAlias = Callable[[int, int], Rows]
 
-# Span: index of a chunk's first row, and of its last row plus one. Result: {name: array} for a
-# chunk, and the warnings of its computation.
+# Span: (start, stop) of a chunk, whose rows are start to stop - 1. Result: computed arrays
+# {name: array} of a chunk, and the warnings of the computation.
 Span: TypeAlias = tuple[int, int]
 Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
 
 
 class Job(Protocol):
-    """Computation on rows. Jobs are sent to workers pickled; a worker unpickles each job once."""
+    """Computation on rows. Workers receive a pickled job, and each worker unpickles it once."""
 
     shapes: dict[str, tuple[int, ...]]  # shape per row of each array of the result
     threaded: bool  # whether threads of this process can compute chunks in parallel
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array], /) -> list[str]:
-        """Write the results of a chunk, whose first row is `start`, into `out`; return warnings."""
+        """Write the results of the chunk that begins at row `start` into `out`; return warnings."""
 
 
 class Execution(ExitStack):
-    """Threads or executor that compute the chunks of a call.
+    """Threads or executor that compute the chunks of jobs.
 
     The object is a context manager; on exit, it ends the worker processes that it started. The
     arguments are described in `sweep`. `InputError` is raised for an invalid argument.
@@ -118,9 +119,9 @@ def run_chunks(
     The store saves the rows and results for which it has arrays. Only chunks that begin before row
     `upto` are computed.
 
-    If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If their
-    results are in memory, `made` creates the attribute `batch` of this error from them. Without
-    `made`, the first failure stops the call with `FflinError`.
+    If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If the
+    store is in memory, the attribute `batch` of this error contains the rows and results of the
+    other chunks, as `made` returns them. Without `made`, the first failure raises `FflinError`.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):
@@ -178,7 +179,8 @@ def _results(
     waiting, running = deque(spans), dict[futures.Future[Result | str], Span]()
     try:
         while waiting or running:
-            # Finished chunks stay in memory until they are saved, so few chunks are submitted.
+            # Submit only a few chunks at a time, because their results stay in memory until they
+            # are saved.
             while waiting and len(running) < _QUEUED * count:
                 span = waiting.popleft()
                 try:
@@ -201,7 +203,7 @@ def _results(
         for future in running:
             future.cancel()
         if inside:
-            # Do not wait for the threads, so that Ctrl-C can also interrupt a compilation.
+            # Do not wait for the threads. Then Ctrl-C ends the call even while a thread compiles.
             pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -213,7 +215,7 @@ def _reason(error: Exception) -> str:
 
 
 def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
-    """Run a pickled job on one chunk, and return its result; a worker calls this function."""
+    """Run a pickled job on one chunk in a worker, and return the result of the chunk."""
     job = _unpickled(pickled)
     out = {key: np.empty((stop - start, *shape)) for key, shape in job.shapes.items()}
     return out, job.run(rows, start, out)
@@ -221,7 +223,7 @@ def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
 
 @lru_cache(maxsize=4)
 def _unpickled(job: bytes) -> Job:
-    """Return an unpickled job; a worker caches the job, so that it is prepared only once."""
+    """Unpickle a job. The cache keeps the job, so that a worker prepares each job only once."""
     with _TURN, warnings.catch_warnings():  # one thread at a time, because threads share filters
         warnings.simplefilter("ignore")  # the caller has received these warnings
         result: Job = pickle.loads(job)
@@ -264,7 +266,8 @@ def _failure(
 class OwnWorkers(futures.ThreadPoolExecutor):
     """Executor with worker processes; if a process dies, its task fails and a new process starts.
 
-    Each thread has its own pool of one process, so that a dying process stops no other process.
+    Each thread of the executor has its own pool of one process, because the death of a process
+    stops all processes of its pool.
     """
 
     def __init__(self, count: int) -> None:
@@ -278,14 +281,17 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         self._ended = ""  # reason why no further process can start
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
-        """Call a function in a worker process; its future raises `FflinError` if that dies."""
+        """Call a function in a worker process.
+
+        If the process dies, the returned future raises `FflinError`.
+        """
         return super().submit(self._do, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        # Do not join the threads, because a join could block forever: if Ctrl-C interrupts a wait
-        # for a future, the future stays locked. The thread that must set its result then never
-        # ends. All other threads end with their processes.
+        # Do not join the threads, because a join could block forever. If Ctrl-C interrupts a wait
+        # for a future, the future can stay locked. The thread that sets the result of this future
+        # then never ends. All other threads end when their processes end.
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
             self._ended = "the workers have been shut down"
@@ -317,8 +323,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
                     ready = pool.submit(int)
                 self._pools.append(pool)
             ready.result()
-            # Only the worker writes results. With this end of the pipe closed, reading ends if the
-            # worker dies while it sends a result, and does not wait forever for the rest.
+            # Close the write end of the result pipe in this process; only the worker writes to the
+            # pipe. If the worker dies while it sends a result, the read then fails immediately.
+            # With an open write end, the read would wait forever for the rest of the result.
             pool._result_queue._writer.close()  # type: ignore[attr-defined]  # typeshed omits it
         except OSError as error:
             self._ended = f"no worker process can be started: {error}"
@@ -332,18 +339,19 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         raise FflinError(self._ended)
 
 
-# Threads start workers and unpickle jobs one at a time, because both change what all threads share:
-# `_starting` a function of multiprocessing, and `_unpickled` the filters of warnings.
+# Lock for `_starting` and `_unpickled`, which only one thread at a time may execute. `_starting`
+# replaces a function of multiprocessing, and `_unpickled` changes the warning filters. All threads
+# share this function and these filters.
 _TURN = Lock()
 
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Start processes that import nothing from the working folder and ignore Ctrl-C.
+    """Return a context in which new processes ignore Ctrl-C and modules in the working folder.
 
-    By default, a process started by multiprocessing looks for modules in the working folder first,
-    until it has copied `sys.path` from its parent process. Ctrl-C also reaches the parent process,
-    which then ends its worker processes.
+    By default, a process that multiprocessing starts looks for modules in the working folder first,
+    until it has copied `sys.path` from its parent process. Worker processes need no Ctrl-C, because
+    the parent process also receives it and ends its workers.
     """
     from multiprocessing import resource_tracker, util
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
-# Limits of the size of a chunk's result [bytes] and of its number of rows. A chunk must take much
+# Limits of the size of a chunk: bytes of its result, and number of its rows. A chunk must take much
 # longer to compute than to send, and several chunks must fit into memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
@@ -152,7 +152,7 @@ def sweep(
     task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
-        # The chunk size is chosen such that every thread or worker computes equally many chunks.
+        # The chunk size is chosen such that all threads or workers compute equally many chunks.
         same = how.count(job)
         size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
         size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
@@ -175,7 +175,7 @@ def sweep(
 
 
 def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
-    """Return the compiled function for the accelerations, or None if Python computes them."""
+    """Return the compiled kernel for accelerations and their derivatives, or None for Python."""
     robot, tree, reason = prepared.robot, batch_tree(prepared.robot), ""
     if prepared.sensing is not None:
         reason = "the outputs are not the state"
@@ -195,8 +195,8 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
 class ChunkJob:
     """Job that linearises chunks of points with `Linearizer`.
 
-    The rows of a chunk contain q; they also contain v or u0 if velocities or inputs are given. If
-    neither is given, the caller sets `at_rest`.
+    The rows of a chunk contain the configurations q. They also contain v if velocities are given,
+    and u0 if inputs are given. If neither is given, the caller sets `at_rest`.
     """
 
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
@@ -204,8 +204,8 @@ class ChunkJob:
         self.linearizer, prepared = linearizer, linearizer.prepared
         self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
-        # For a free-floating robot at rest, without springs, A and f0 are the same at all points if
-        # each point is its own reference. Only B is then computed.
+        # A and f0 are the same at all points if the robot is at rest, no forces such as springs or
+        # gravity act on it (`free`), and each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
         nx, nu = prepared.map.nx, len(prepared.actuation.names)
         ny = len(prepared.common["output_names"])
@@ -243,7 +243,7 @@ class ChunkJob:
         return [str(note.message) for note in caught]
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write rows in compiled code, and return the indices of rows that Python must compute."""
+        """Write results into `out` by compiled code; return the indices of rows left to Python."""
         kernel, q = self._kernel, rows["q"]
         count = len(q)
         if kernel is None:
@@ -266,7 +266,7 @@ class ChunkJob:
     def _write_anywhere(
         self, kernel: RowAccelerations, rows: Rows, out: Mapping[str, Array]
     ) -> Mask:
-        """Write the models about points of any kind, and return the mask of valid rows."""
+        """Write the models about points at rest or in motion; return the mask of valid rows."""
         ready, q, A, B = self.linearizer.prepared, rows["q"], out["A"], out["B_lower"]
         state, actuation, count = ready.map, ready.actuation, len(q)
         own = ready.own_reference
@@ -307,8 +307,8 @@ class SweepTask:
     ) -> None:
         self.job, self.robot = job, (robot := job.linearizer.robot)
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
-        # `_points` generates configurations on demand. `_known` contains the given arrays; a single
-        # velocity or input for all points is broadcast to rows.
+        # `_points` generates configurations on demand. `_known` contains the given arrays. A single
+        # v or u for all points is broadcast to one row per point.
         points = checked_points(robot, q)
         self._points = None if isinstance(points, np.ndarray) else points
         self._known = {"q": points} if isinstance(points, np.ndarray) else {}
@@ -321,8 +321,8 @@ class SweepTask:
             nu = len(prepared.actuation.names)
             of_inputs = partial(vector, "u", size=nu, of_what="the robot's inputs")
             self._known["u0"] = checked_rows("u", u, nu, of_inputs, count)
-        # `given`: the known arrays that vary between points. `shapes`: the shapes, per point, of
-        # all arrays that vary between points.
+        # `given`: the arrays in `_known` that vary between points. `shapes`: the shapes, per point,
+        # of all arrays that vary between points.
         self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
         self.shapes = {**job.shapes, "q": (robot.nq,)}
         self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
@@ -366,7 +366,7 @@ class SweepTask:
 
     @property
     def request(self) -> str:
-        """Digest of the robot, the options and the points, on which the result depends."""
+        """Digest of all data that determine the result: the robot, the options and the points."""
         robot, prepared = self.robot, self.job.linearizer.prepared
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
         placements = [placement.homogeneous for placement in robot.model.jointPlacements]

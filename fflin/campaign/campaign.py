@@ -363,7 +363,7 @@ class Campaign(FrozenArrays):
         write_atomically({target: CODECS[".mat"][0](table, True)})
 
     def _save(self, path: Path, **texts: str) -> None:
-        """Write the campaign, and strings such as the digest that identifies the call."""
+        """Write the campaign and additional strings, such as the digest of the call, to a file."""
         arrays = {key: np.ascontiguousarray(getattr(self, key)) for key in ARRAYS}
         rest = {key: getattr(self, key) for key in _HEADER}
         texts["header"] = json.dumps({"kind": "Campaign", **rest})
@@ -395,9 +395,9 @@ class Campaign(FrozenArrays):
     ) -> Campaign:
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
-        values: dict[str, Any] = {
-            key: arrays[key] if run.all() else arrays[key][run] for key in ARRAYS
-        }
+        values = dict[str, Any]()
+        for key in ARRAYS:
+            values[key] = arrays[key] if run.all() else arrays[key][run]
         for key in _HEADER:
             value = header[key]
             values[key] = tuple(value) if isinstance(value, list) else value

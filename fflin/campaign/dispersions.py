@@ -1,11 +1,12 @@
-"""Dispersions: named random values, which determine the robot and initial state of each run."""
+"""Dispersions: named random values that determine the robot and initial state of each run."""
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, repeat
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -53,7 +54,7 @@ class Column(NamedTuple):
 
 
 class Dispersions:
-    """Dispersions of `monte_carlo`, which draw the robot and initial state of each run."""
+    """Dispersions of `monte_carlo`; they draw the robot, policy and initial state of each run."""
 
     def __init__(
         self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
@@ -69,7 +70,7 @@ class Dispersions:
             sensors = reads.lin.output_names
         elif isinstance(reads, TrajectoryOutputFeedback):
             sensors = reads.filter.output_names
-        modes = tuple(each.name for each in robot.modes)
+        modes = tuple(map(attrgetter("name"), robot.modes))
         # {kind of dispersion: names of the quantities that can be dispersed}.
         self._known: dict[str, tuple[str, ...]] = {
             **dict.fromkeys(_OF_SENSORS, sensors),
@@ -81,7 +82,7 @@ class Dispersions:
         kinds = [*self._known]
         self._known |= {"state": plant.state.names, "delay": ("delay",), "seed": (SEED,)}
         # Joint index of each mode, in the order of `modes`.
-        self._modes = [robot.joint_names.index(name) for name in modes]
+        self._modes = [*map(robot.joint_names.index, modes)]
         by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -107,10 +108,10 @@ class Dispersions:
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, " | ".join(kinds))
         # Names of the dispersed values.
-        self.names = tuple(column.name for column in self.columns)
+        self.names = tuple(map(attrgetter("name"), self.columns))
         # Cached values of slow distributions: {(name, block of runs): values}.
         self._kept: dict[tuple[str, int], Array] = {}
-        # A mass must not be dispersed twice: once for a link, and again for the link's body.
+        # A mass must not be dispersed twice, such as for a link and for the whole body of the link.
         pieces = [*robot.pieces.values()]
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
@@ -125,8 +126,9 @@ class Dispersions:
     def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
         """Add the columns of one kind of dispersion.
 
-        `spreads` maps a name or pattern to an inverse distribution function, and to the common name
-        of tied values; the common name is "" for independent values.
+        `spreads` is {name or pattern: (inverse distribution function, common name)}. If the common
+        name is not empty, all names of the pattern share one value of this name. `kinds` is a text
+        for error messages.
         """
         robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
@@ -176,11 +178,11 @@ class Dispersions:
     ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: its key in `spreads`}.
 
-        The second result omits links and bodies that only a pattern matches.
-        A key without a wildcard overrides patterns that match the same link or body.
+        The second mapping contains only the links and bodies for which a key has no wildcard. Such
+        a key overrides patterns that match the same link or body.
         """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
-        alone = {*robot.pieces, *robot.link_of}
+        alone, whole = {*robot.pieces, *robot.link_of}, set[int]()
         for key in sorted(spreads, key=alone.__contains__):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
@@ -190,7 +192,8 @@ class Dispersions:
                 found[name] = spreads[key]
                 if key in alone:
                     named[name] = key
-        whole = {robot.pieces[name].joint for name in named if robot.pieces[name].whole}
+                    if robot.pieces[name].whole:
+                        whole.add(robot.pieces[name].joint)
         for name in found.keys() - named:
             if robot.pieces[name].joint in whole:
                 del found[name]
@@ -199,7 +202,7 @@ class Dispersions:
     def drawn(self, start: int, stop: int) -> Array:
         """Return the drawn values (N, k) of runs start to stop - 1.
 
-        A value depends only on the seed, the name of the value and the number of the run.
+        Each value is determined by its distribution, its name, the seed and the number of the run.
         """
         drawn = np.empty((stop - start, len(self.columns)))
         for at, column in enumerate(self.columns):
@@ -210,9 +213,9 @@ class Dispersions:
         return drawn
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:
-        """Return a column's values in a block of runs, at least the first `count` of them.
+        """Return at least the first `count` values of a column in a block of _BLOCK runs.
 
-        Values of slow distributions are cached for later calls.
+        The values of slow distributions are cached for later calls.
         """
         key = (self._seed, zlib.crc32(column.name.encode()))
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
@@ -233,7 +236,7 @@ class Dispersions:
         return kept
 
     def require_possible(self, runs: int) -> None:
-        """Raise `InputError` if a drawn value gives an invalid robot or attitude."""
+        """Raise `InputError` if a drawn value gives an invalid robot or initial attitude."""
         for start in range(0, runs, _BLOCK):
             drawn = self.drawn(start, min(start + _BLOCK, runs))
             for values, column in zip(drawn.T, self.columns, strict=True):
@@ -250,7 +253,7 @@ class Dispersions:
             said = f"an invalid initial attitude is drawn in the runs from {start} on"
             try:
                 self.starts(drawn)
-                # A drawn inertia can be too small for the flexible modes of its body.
+                # A drawn mass or inertia can be too small for the flexible modes of its body.
                 if self._plant.robot.appendages:
                     refused = first_impossible(self._plant.robot, self.bodies(drawn))
                     if refused is not None:
@@ -260,7 +263,10 @@ class Dispersions:
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
-        """Return the values of a kind, (N, size) or (N, size, axes); `rest` if not dispersed."""
+        """Return the drawn values of a kind of dispersion, (N, size) or (N, size, axes).
+
+        Quantities that are not dispersed have the value `rest`.
+        """
         axes = len(_AXES.get(kind, " "))
         found = np.full((len(drawn), len(self._known[kind]), axes), rest)
         for values, column in zip(drawn.T, self.columns, strict=True):
@@ -273,18 +279,24 @@ class Dispersions:
         return self._plant.state.points(self._x0 + self._of("state", drawn))[1:]
 
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
-        """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of the dispersed bodies."""
+        """Return {joint: (masses (N,), centres of mass (N, 3), inertias (N, 3, 3))} of bodies.
+
+        Only dispersed bodies are included. The inertias are about the centres of mass.
+        """
         robot, model = self._plant.robot, self._model
-        pieces, changed = [*robot.pieces.values()], dict[int, list[Array]]()
-        mass, com, inertia, density = (self._of(kind, drawn) for kind in _OF_BODIES)
-        dispersed = {at for each in self.columns if each.kind in _OF_BODIES for at in each.at}
+        pieces, dispersed = [*robot.pieces.values()], set[int]()
+        mass, com, inertia, density = map(self._of, _OF_BODIES, repeat(drawn))
+        for column in self.columns:
+            if column.kind in _OF_BODIES:
+                dispersed.update(column.at)
+        changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4)
         for at in sorted(dispersed):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            changed.setdefault(own, []).append(varied(pieces[at], *changes))
-        before = {joint: model.inertias[joint].toPseudoInertia().toMatrix() for joint in changed}
-        return {joint: properties(before[joint] + sum(x)) for joint, x in changed.items()}
+            before = changed.get(own, model.inertias[own].toPseudoInertia().toMatrix())
+            changed[own] = before + varied(pieces[at], *changes)
+        return dict(zip(changed, map(properties, changed.values()), strict=True))
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
         """Return {"stiffness" or "damping": values (N, n) of all joints}.
@@ -292,7 +304,8 @@ class Dispersions:
         A property that is not dispersed is omitted.
         """
         found = dict[str, Array]()
-        # A change of a mode's frequency does not change its damping ratio.
+        # A mode has the stiffness w^2 and the damping 2 zeta w. If its frequency w changes, its
+        # damping ratio zeta remains the same.
         frequency = 1.0 + self._of("frequency", drawn)
         for kind, power in zip(_OF_SPRINGS, (2, 1), strict=True):
             if self._kinds & {kind, "frequency"}:
@@ -313,7 +326,7 @@ class Dispersions:
         return ActuatorFaults(1.0 + gain, bias, until, np.concatenate(turn, axis=1))
 
     def delays(self, drawn: Array) -> Array:
-        """Return the delays (N,) in integration steps."""
+        """Return the total delays (N,) of the inputs, in integration steps."""
         late = self._of("delay", drawn)[:, 0] / self._times.dt
         return np.maximum(0.0, np.rint(self._times.delay + late))
 
@@ -328,12 +341,12 @@ class Dispersions:
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (count, 1, 1))
             for at, body in self.bodies(drawn).items():
-                # The tree also numbers the wheels, so a body has another index than in `_model`.
+                # The tree also contains the wheels, so a body has another index than in `_model`.
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The changed body does not include its wheels, but the parameters in the tree do.
-                # So only the change of the body is added to them.
+                # The parameters in the tree include the wheels of the body, but the changed body
+                # does not. So only the change of the body is added to the parameters.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
@@ -355,17 +368,15 @@ class Dispersions:
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
-        """Return the plant and the policy of one run, and its initial q and v."""
+        """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
         plant, policy, rows = self._plant, self._policy, drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
         if bodies:
-            robot = robot.with_bodies(
-                {
-                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
-                    for joint, (mass, com, inertia) in bodies.items()
-                }
-            )
+            drawn_bodies = dict[int, pin.Inertia]()
+            for joint, (mass, com, inertia) in bodies.items():
+                drawn_bodies[joint] = pin.Inertia(float(mass[0]), com[0], inertia[0])
+            robot = robot.with_bodies(drawn_bodies)
         springs = {"stiffness": robot.stiffness, "damping": robot.damping}
         for kind, values in self._springs(rows).items():
             springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))
@@ -385,14 +396,17 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Policy that the function `bind` binds to a robot; it was designed for the model `lin`."""
+    """Policy whose method `bind` is a given function; `lin` is the model of its design."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None
 
 
 def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
-    """Return a policy that reads its states or outputs (ny,) with a bias and random noise."""
+    """Return `policy` with a bias and white noise in the states or outputs (ny,) that it reads.
+
+    `deviation` is the standard deviation of the noise.
+    """
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
     generator, given = noise_generator(seed[0]), getattr(policy, "noise", None)
@@ -416,10 +430,10 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return the inertial parameters (N, 10) of bodies in the axes that are columns of `axes`.
+    """Return the inertial parameters (N, 10) of bodies along the columns of `axes` (3, 3).
 
-    The parameters are the mass m, the vector m c with the centre of mass c, and six entries (xx xy
-    xz yy yz zz) of the inertia about the origin.
+    The parameters are the mass m, the first moment m c with the centre of mass c, and six entries
+    (xx xy xz yy yz zz) of the inertia about the origin.
     """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
@@ -437,7 +451,7 @@ def turned(direction: object, angles: Array) -> Array:
 
 
 def _misaligned(robot: Robot, angles: Array) -> Robot:
-    """Return a robot whose thrusters and wheel axes are rotated by angles (nu, 2) [rad]."""
+    """Return a robot whose thrusters and wheels are misaligned by angles (nu, 2) [rad]."""
     inputs = list(robot.inputs)
     for place, item, _, at, direction in _mounted(robot):
         inputs[place] = _pointed(item, turned(direction, angles[at : at + 1])[0])
@@ -447,7 +461,8 @@ def _misaligned(robot: Robot, angles: Array) -> Robot:
 def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     """Return the arrays of the compiled loop that change with misalignment angles (N, nu, 2).
 
-    The arrays are wrenches of inputs, stored momenta, joint placements and changes of inertias.
+    The arrays contain the wrenches of the inputs, the stored momenta, the joint placements, and the
+    changes of the body parameters. Each has one row per run.
     """
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
@@ -488,7 +503,7 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
 def _mounted(
     robot: Robot,
 ) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int, Array]]:
-    """Yield thrusters and wheels: index in `robot.inputs`, item, names, index in u, direction."""
+    """Yield (index in `robot.inputs`, item, names, index in u, direction) per thruster or wheel."""
     first = 0
     for place, (item, names) in enumerate(robot.named_inputs):
         if isinstance(item, Thruster | ReactionWheel):

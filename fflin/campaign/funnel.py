@@ -32,10 +32,10 @@ _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance
 _MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
 
-# The search for the largest level simulates _PILOTS runs at each trial level, and halves the level
-# at most _HALVINGS times.
+# The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
+# root of the level at most _HALVINGS times.
 _PILOTS, _HALVINGS = 16, 40
-# Largest initial errors: of the attitude [deg], of a revolute joint [rad], and of the position or a
+# Largest initial error of the attitude [deg], of a revolute joint [rad], and of the position or a
 # prismatic joint [m].
 _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 
@@ -43,9 +43,9 @@ _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 def ellipsoid_axes(P: Array) -> Array:
     """Return W (nx, nx) such that W W' is a generalised inverse of P.
 
-    P is first scaled to a unit diagonal, because its states have different units. W then contains
-    the symmetric square root of the pseudoinverse of P, because this root is unique. Eigenvectors
-    are not unique, so errors drawn along them would depend on rounding.
+    P is first scaled to S P S, which has a unit diagonal, because the states have different units.
+    Then W = S R, where R is the symmetric square root of the pseudoinverse of S P S. This root is
+    unique. Eigenvectors are not unique, so errors drawn along them would depend on rounding.
     """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -386,10 +386,10 @@ def funnel(
 def _outcomes(
     final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the codes of the outcomes of runs; see `Funnel.outcomes`.
+    """Return {"outcome": codes (N,)} of runs; `Funnel` lists the codes.
 
     `final` contains bounds of the final errors, and `within` contains bounds of the errors at all
-    times. P (nx, nx) is the matrix of the final level.
+    times. The level of a final error e is e' P e.
     """
     e = runs["state_errors"][:, -1]
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
@@ -406,15 +406,16 @@ def _tested(
 ) -> tuple[float, Array]:
     """Return the largest level tested at a knot, and the outcomes (samples,) up to that level.
 
-    The largest level is chosen such that about one run in 16 fails at this level. P (nx, nx) is the
-    matrix of the level.
+    The largest level is chosen such that about one run in 16 fails at this level. The level of an
+    error e is e' P e.
     """
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
     def simulate(roots: Array) -> Array:
         """Simulate runs from random errors e with sqrt(e' P e) = `roots`; return the outcomes."""
         e = rng.normal(size=(len(roots), len(P))) @ W.T
-        # Directions in which P is zero do not contribute to the level.
+        # Scale the errors by their levels and not by the norms of the random vectors, because
+        # components along which P is zero do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
         starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
         return completed(job, starts, how)["outcome"]
@@ -425,8 +426,8 @@ def _tested(
         np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
         *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
     ]
-    # `root` is the square root of a level. At `widest`, an error on the ellipsoid reaches one of
-    # the largest initial errors.
+    # `root` is the square root of a level. If it is `widest`, the ellipsoid of this level reaches
+    # one of the largest initial errors.
     root = widest = float(1.0 / max(reach))
     # If the run without an initial error already misses the goal, the widest level is tested.
     if not simulate(np.zeros(1)).any():
@@ -447,7 +448,10 @@ def runs_from(
     options: Mapping[str, object],
     judge: Judge = of_campaign,
 ) -> CampaignJob:
-    """Return a job for runs that start at a knot; `knot` has its indices as in `_indices`."""
+    """Return a job for runs that start at a knot.
+
+    `knot` contains the indices of the knot in the trajectory and in the schedule.
+    """
     motion, schedule, (k, first) = feedback.trajectory, feedback.schedule, knot
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
     later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
@@ -455,7 +459,7 @@ def runs_from(
         feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
     )
     # The attitude at the knot can be any rotation, so the chart is centred at this attitude.
-    # Histories have two entries, at the start and at the end.
+    # The histories have two entries: at the start and at the end of a run.
     options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 

@@ -1,4 +1,4 @@
-"""Monte Carlo simulation of a closed loop with random parameters, starts and sensor errors."""
+"""Monte Carlo simulation of a loop with random parameters, initial states and sensor errors."""
 
 import json
 import math
@@ -209,7 +209,7 @@ def monte_carlo(
     if how.executor:
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
-    none = {key: np.zeros((0, *shape)) for key, shape in shapes.items()}
+    none = files.MemoryStore(0, size, shapes).arrays
     header["goals"] = wanted = _goals(goals, until, Campaign.of(none, {**header, "goals": ()}))
     with placed(dispersions):
         job.dispersions.require_possible(runs)
@@ -268,7 +268,10 @@ def _require_sendable(job: CampaignJob) -> None:
 
 
 def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
-    """Return the goals; each is evaluated on the empty campaign `none` to find invalid goals."""
+    """Return the goals, including `until`.
+
+    Each goal is evaluated on the empty campaign `none`, so that an invalid goal raises an error.
+    """
     listed = [given] if isinstance(given, str) else given
     goals: list[str] = [
         *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
@@ -280,7 +283,10 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign in a file that the same call wrote; raise an error for any other file."""
+    """Return the campaign in a file that this call wrote earlier, or None if there is no file.
+
+    Raise `FileError` if a different call wrote the file.
+    """
     if not path.is_file():
         return None
     with suppress(FileError), reading(path, "Campaign"):
@@ -293,12 +299,14 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 
 def _header(job: CampaignJob) -> dict[str, object]:
-    """Return the header of a campaign: all fields that are not arrays."""
-    plan, plant, robot = job.plan, job.plant, job.plant.robot
-    others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
-    steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
-    steered -= set() if pushed(plant.actuation) else {"r_b"}
-    groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
+    """Return the fields of a campaign that are not arrays and follow from its job."""
+    plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
+    fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
+    for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
+        if fed_back[part][job.kinds[part] == number].any():
+            judged.append(kind)
+    if "position" in judged and not pushed(plant.actuation):
+        judged.remove("position")
     return {
         "kind": "Campaign",
         "names": job.dispersions.names,
@@ -306,7 +314,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "state_units": plant.state.units,
         "input_names": plant.actuation.names,
         "input_units": plant.actuation.units,
-        "judged": [kind for kind, group in groups if group in steered],
+        "judged": judged,
         "robot": robot.name,
         "urdf_sha256": robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,
@@ -318,7 +326,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
 
 
 def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
-    """Return a digest of the call and its drawn values, on which the result depends."""
+    """Return a digest of the data that determine the result: the call and its drawn values."""
     drawn = job.dispersions.drawn(0, min(runs, _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))

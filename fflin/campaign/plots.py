@@ -207,9 +207,9 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands of values (N, M) over time for the runs `of`, and a line for each of `runs`."""
-    # Infinite values of stopped runs are drawn at the upper edge. To avoid interpolation with this
-    # edge, each bound of a band is the value of one run.
+    """Draw bands over time of the values (N, M) in the runs `of`, and a line per run in `runs`."""
+    # Infinite values of stopped runs are drawn at the upper edge of the axes. Each bound of a band
+    # is the value of one run, because interpolation could mix finite values with this edge.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -235,14 +235,17 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
 
 
 def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
-    """Draw the bounds in the goals for the named quantities."""
+    """Draw the bounds that the goals set for the named quantities."""
     for bound in campaign.bounds:
         if bound.name in names:
             draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
-    """Draw histograms of the final and the largest error of the completed runs."""
+    """Draw histograms of the errors of completed runs, final and largest, and their percentiles.
+
+    The percentiles include the stopped runs.
+    """
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
     of = {name: campaign.values(name)[~campaign.stopped] for name in names}
     values = np.append(list(of.values()), 0.0)
@@ -266,7 +269,10 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
 def _inputs(
     axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
 ) -> None:
-    """Draw the largest input of a group in the completed runs over time, and the input limit."""
+    """Draw the largest magnitude in a group of inputs over time, and the limit of the group.
+
+    Only completed runs are included. The limit is omitted if it is far above these values.
+    """
     largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
     if not campaign.stopped.all():
         _bands(axes, campaign, largest, runs, ~campaign.stopped)
@@ -279,7 +285,10 @@ def _inputs(
 
 
 def _correlations(axes: Axes, campaign: Campaign) -> None:
-    """Draw the rank correlations with `Campaign.about`, and the range that is not significant."""
+    """Draw the rank correlations of the drawn values with the figure `Campaign.about`.
+
+    A grey area marks correlations that are not significant.
+    """
     found = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)

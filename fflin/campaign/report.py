@@ -41,23 +41,23 @@ def campaign_report(campaign: Campaign) -> str:
 
 
 def ended_of(campaign: Campaign) -> str:
-    """Return the number of completed runs, and the numbers of stopped runs by reason."""
+    """Format the number of completed runs, and the number of stopped runs for each reason."""
     said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
     return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
 
 
 def goal_met(campaign: Campaign, goal: str) -> str:
-    """Return the success rate of a goal, with its confidence interval."""
+    """Format the success rate of a goal and the confidence interval of this rate."""
     met = campaign.fraction(goal, confidence=campaign.confidence)
     value, low, high = (f"{100.0 * x:.4g}" for x in met)
     return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
 
 
 def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
-    """Return the significant rank correlations of the drawn values with each quantity of interest.
+    """Return {quantity: {drawn value: rank correlation}} with the significant correlations only.
 
-    At most five quantities are included, in this order: `Campaign.about`, the quantities in the
-    goals, the worst errors and the settling time.
+    The quantities are the first five of this list: `Campaign.about`, the quantities in the goals,
+    the worst errors and the settling time.
     """
     doubt = 3.0 / math.sqrt(len(campaign))
     about = [campaign.about, *(x.name for x in campaign.bounds)]
@@ -69,15 +69,15 @@ def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
 
 
 def worst_runs(campaign: Campaign, k: int) -> list[str]:
-    """Return a table of the k worst runs, with the most influential draw of each run."""
+    """Return a table of the k worst runs, with the most influential drawn value of each run."""
     if not k:
         return []
     about, (values, unit) = campaign.about, campaign.figure(campaign.about)
     rows = [["run", about, "unit", "settling [s]", "end [s]", "most influential draw"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
-    # A draw is influential if it is far from the median and its correlation is large. The seed of
-    # the noise has no correlation, so it is never influential.
+    # A drawn value is influential if it is far from the median and its correlation is large. The
+    # seed of the noise has no correlation, so it is never influential.
     out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
@@ -95,7 +95,7 @@ def _when(time: float, unit: str = "") -> str:
 
 
 def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
-    """Return the report as JSON values, with estimates as [value, low, high].
+    """Return the report as JSON values; an estimate is [value, low, high].
 
     Infinity is written as null.
     """

@@ -38,8 +38,8 @@ from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
 from fflin.simulation.run import Recording, go, stop_conditions, stop_of
 from fflin.simulation.simulate import motion_of
 
-# Kinds of errors with their units. The attitude error is the rotation angle. Any other error is the
-# largest magnitude of the states of its kind; wheels and modes do not count as joints.
+# {kind of error: unit}. The attitude error is the rotation angle. Any other error is the largest
+# magnitude of the state errors of its kind; wheels and modes do not count as joints.
 KINDS = {
     "attitude": "deg",
     "position": "m",
@@ -48,21 +48,20 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
-# If the attitude error exceeds this [deg], a run counts as having left the chart, which ends at
-# 180 deg.
+# Attitude error [deg] above which a run counts as having left the chart. The chart ends at 180 deg.
 EDGE = 176.0
-# LOOK is the number of steps between checks of a stop condition. _LONG is the number of steps per
-# call without a stop condition.
+# LOOK is the number of steps between checks of the condition `over`. Without such a condition, one
+# call of the compiled loop computes up to _LONG steps.
 LOOK, _LONG = 64, 2**20
 
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
 
-# Function that returns the mask (N,) of runs to end; its arguments are the state errors (N, nx) at
-# the start and the present state errors (N, nx).
+# Function that returns the mask (N,) of runs to end. Its arguments are the initial state errors
+# (N, nx) and the present state errors (N, nx).
 Over: TypeAlias = Callable[[Array, Array], Mask]
 
-# Former names of kinds, which conditions and goals still accept.
+# {former name: kind of error}. Conditions and goals still accept the former names.
 _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
 
@@ -79,34 +78,36 @@ Judge: TypeAlias = Callable[[Mapping[str, Array]], dict[str, Array]]
 
 
 def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the outcomes that are arrays of a `Campaign`."""
-    return {key: values for key, values in outcomes.items() if key != "state_errors"}
+    """Return the arrays of `outcomes` that a `Campaign` contains: all except `state_errors`."""
+    found = dict(outcomes)
+    del found["state_errors"]
+    return found
 
 
 def kinds_of(state: StateMap) -> Indices:
     """Return the index into KINDS of each state (nx,).
 
-    The index is 0 for the attitude and for states without a kind, such as modes. The index is -1
-    for wheels.
+    The index is -1 for the angles of wheels, whose errors are not counted. The index is 0 for the
+    attitude and for all states without a kind: modes and wheel speeds.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
-    groups, wheels = state.groups, state.robot.wheels
+    groups, wheels, modes = state.groups, state.robot.wheels, state.robot.modes
     for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
         kind[group] = number
     kind[groups.qdot_m] = len(KINDS) - 1
     for index, joint in enumerate(state.robot.joints):
-        if joint.mode or joint.name in wheels:
-            kind[groups.q_m.start + index] = 0 if joint.mode else -1
+        if joint in modes or joint.name in wheels:
+            kind[groups.q_m.start + index] = 0 if joint in modes else -1
             kind[groups.qdot_m.start + index] = 0
     return kind
 
 
 class CampaignJob:
-    """Job for runs of one plan, each with its own drawn values; see `batch.run.Job`.
+    """Job that simulates runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    Without dispersions, the drawn values are the deviations of the initial state. The arrays of the
-    result are those that `judge` returns. The condition `over` can end runs early; it needs
-    histories, because it compares errors with the initial errors.
+    If `given` is None, the drawn values are the deviations (nx,) of the initial state. The function
+    `judge` returns the arrays of the result. The condition `over` can end runs early. It needs
+    histories, because it compares the present errors with the first entry, the initial errors.
     """
 
     def __init__(
@@ -132,6 +133,7 @@ class CampaignJob:
             self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.judge, self.over = judge, over
         self.plant, times = self.plan.plant, self.plan.times
+        self.kinds = kinds_of(self.plant.state)
         self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
@@ -151,8 +153,9 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # `outcome_shapes` has the shape, per run, of each array of an outcome, and `shapes` of each
-        # array of the job's result. They are read from the outcome of a run without steps.
+        # `outcome_shapes` contains the shape of each array of an outcome, and `shapes` the shape,
+        # per run, of each array that `judge` returns. The outcome of a run without steps shows
+        # these shapes.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
         outcome = self.outcome(none)
@@ -171,11 +174,11 @@ class CampaignJob:
         return {"drawn": self.dispersions.drawn(start, stop)}
 
     def digest(self, first: Array) -> str:
-        """Return a digest of the robot, the policy, the options and the first run (1, k).
+        """Return a digest of the robot, policy, options and the first run's drawn values (1, k).
 
-        With the compiled engine, it is the digest of the arrays that the loop reads; it needs no
-        compilation. With the Python engine, the policy can be any function, whose content cannot be
-        hashed. The digest is then computed from the outcome of the first run.
+        With the compiled engine, the digest is computed from the arrays that the loop reads; this
+        needs no compilation. With the Python engine, the policy can be any function, whose content
+        cannot be hashed. Therefore the digest is computed from the outcome of the first run.
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
@@ -196,7 +199,7 @@ class CampaignJob:
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
         drawn = rows["drawn"]
-        found = {key: np.empty((len(drawn), *x)) for key, x in self.outcome_shapes.items()}
+        found = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
             eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
@@ -214,7 +217,10 @@ class CampaignJob:
         return []
 
     def errors(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the states (N, nx) for q and v at the first N steps, and the state errors."""
+        """Return the states (N, nx) and the state errors (N, nx) for q and v.
+
+        If the target moves, q and v must be at steps 0 to N - 1.
+        """
         state, target = self.plant.state, self.target
         first = target if target.ndim == 1 else target[0]
         x = unwound(state, states_of(state, q, state.velocities(v)), first)
@@ -225,16 +231,17 @@ class CampaignJob:
     def outcome(self, run: Recording) -> dict[str, Array]:
         """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
 
-        The outcome also contains the state errors at the times of the histories; they are NaN after
-        the run was stopped.
+        The outcome also contains `state_errors`, the history of the state errors. Its entries are
+        NaN after the run was stopped.
         """
         count, steps, dt = len(run.q), self.steps, self.plan.times.dt
-        kind, target = kinds_of(self.plant.state), self.target
-        target = target[:count] if target.ndim == 2 else target
+        target = self.target[:count] if self.target.ndim == 2 else self.target
         x, signed = self.errors(run.q, run.v)
-        e, u = np.where(kind < 0, 0.0, np.abs(signed)), np.abs(run.u)
-        others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
-        sizes = np.column_stack([attitude_errors(x, target), *others])
+        e, u = np.where(self.kinds < 0, 0.0, np.abs(signed)), np.abs(run.u)
+        sizes = np.empty((count, len(KINDS)))
+        sizes[:, 0] = attitude_errors(x, target)
+        for kind in range(1, len(KINDS)):
+            sizes[:, kind] = e[:, self.kinds == kind].max(axis=1, initial=0.0)
         settled, stop = settled_at(sizes), stop_of(run.stopped)
         late, kept = is_late(settled, count) | (stop > 0), steps[steps < count]
 
@@ -282,7 +289,7 @@ class CampaignJob:
         return self.outcome(_recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
-        """Estimate the time [s] of `count` runs on one core, from a few steps of the first runs."""
+        """Estimate the computing time [s] of `count` runs on one core from a few steps of runs."""
         few, plan, drawn, times = copy(self), self.plan, first[: self.lanes], list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
@@ -328,7 +335,7 @@ class RunStatistics(lanes.Statistics):
             x_ref=first,
             q_ref=q_ref,
             nu_ref=nu_ref,
-            kind=kinds_of(state),
+            kind=job.kinds,
             settled=SETTLED,
             tolerance=np.full(kinds, THERE),
             steps=job.steps,
@@ -350,19 +357,19 @@ class RunStatistics(lanes.Statistics):
             values[:] = initial
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of runs that the judge ends at q and v (LANES, ..)."""
+        """Return the mask (LANES,) of runs that `CampaignJob.over` ends at q and v (LANES, ..)."""
         over, first = self._job.over, _by_run(self._marks.states[: self._state.nx])
         return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
 
     def add(self, first: int, rows: Array) -> None:
-        """Add steps from step `first` on; `rows` (steps, width, LANES) has q, nu, u and more."""
+        """Add steps from step `first` on; `rows` (steps, width, LANES) begins with q, nu and u."""
         take = kernel("loop", "take")
         take(self._words, rows.reshape(-1, LANES), first, len(rows))
         sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
         self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of eight runs after `done` steps; `stop` has indices into STOPS."""
+        """Return the outcomes of eight runs after `done` steps; `stop` has indices into `STOPS`."""
         (q, nu, u), marks, times = self._last, self._marks, len(self._job.steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
@@ -385,7 +392,7 @@ class RunStatistics(lanes.Statistics):
 
 
 def _by_run(values: Array, *shape: int) -> Array:
-    """Convert values (.., LANES), with the runs along the last axis, to rows (LANES, *shape)."""
+    """Convert values (.., LANES), with one run per column, to rows (LANES, *shape)."""
     shape = shape or (len(values),)
     return np.moveaxis(np.reshape(values, (*shape, LANES)), -1, 0)
 
@@ -403,7 +410,7 @@ def expect(
 ) -> None:
     """Report the estimated time of jobs to a progress bar.
 
-    Each entry of `work` is a job, the draws of its first runs, and its number of runs. Only the
+    Each entry of `work` is (job, drawn values of its first runs, number of runs). Only the
     progress bar of the command line has the method `expect`; other progress functions do not
     receive the estimate.
     """

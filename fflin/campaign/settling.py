@@ -1,7 +1,8 @@
 """Settling of a regulated robot from random displacements, measured with an error norm.
 
-The norm is the square root of a Lyapunov function of the linear loop. Along the linear loop, this
-function decreases at a rate that is a quadratic form in units of energy.
+The norm of a deviation z is sqrt(z' P z), where z' P z is a Lyapunov function of the linear loop.
+Its rate of decrease along the linear loop is z' Q z. Q is diagonal, and z' Q z has the unit of
+energy.
 """
 
 import math
@@ -24,10 +25,11 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.run import STOPS
 
-# A run has settled or diverged if its error reaches these multiples of the initial error.
+# A run has settled if its error is at most SETTLED times the initial error, and diverged if its
+# error is at least DIVERGED times the initial error.
 SETTLED, DIVERGED = 1e-3, 1e3
-# Duration of a run that is compared with the prediction, in time constants of the slowest pole.
-# Duration of a random run, in settling times of the slowest pole.
+# _CONSTANTS: duration of a run that is compared with the prediction, in time constants of the
+# slowest pole. PATIENCE: largest duration of a random run, in settling times of the slowest pole.
 _CONSTANTS, PATIENCE = 3.0, 3.0
 _STEP = 0.25  # time step times the fastest pole
 _WIDEST = 10.0  # largest joint displacement [rad] to which the step is adapted
@@ -86,8 +88,8 @@ class Loop:
 
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # The weight of a coordinate is the weight of its rate times the decay rate of the loop. For
-        # some rates, the model has no coordinate.
+        # `of` and `size` contain square roots of weights. The root for a coordinate is the root for
+        # its velocity times the decay rate of the loop. Some velocities have no coordinate.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
@@ -105,8 +107,8 @@ class Loop:
     ) -> Array:
         """Return a state (nx,) in which the states of the model are displaced at random.
 
-        The attitude [deg] and the position [m] are displaced by the given amounts. The largest
-        displacement of a joint [rad|m] is `joint`.
+        The displacements of the base are `attitude` [deg] and `position` [m]. The largest
+        displacement of a joint is `joint` [rad|m].
         """
         g, x = self.state.groups, self.start.copy()
         axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
@@ -127,9 +129,10 @@ class Loop:
     ) -> CampaignJob:
         """Return a job that simulates the loop from displaced states.
 
-        A run ends when it settles or diverges, or at a horizon. With `predicts`, a run always lasts
-        three time constants and is compared with the linear loop. `joint` is the largest
-        displacement of a joint. `fine` is the number of times that the steps have been shortened.
+        A run ends when it settles or diverges, or after PATIENCE settling times. With `predicts`, a
+        run always lasts _CONSTANTS time constants, and is compared with the linear loop. `joint` is
+        the largest displacement of a joint [rad|m]. `fine` states how often diverging runs have
+        been repeated with shorter steps.
         """
         lin, decay = self.lin, self.decay
         # The step is also limited by the poles of the open loop, because the loop is open between
@@ -163,8 +166,9 @@ class Loop:
         """Return the transition matrix of the linear loop from one check to the next.
 
         For a linear system, the integrator CF4 equals the classical Runge-Kutta method. Each step
-        then multiplies the state by a fourth-order Taylor polynomial of the matrix exponential. The
-        linear loop uses the same polynomial, so the simulated loop differs only by nonlinear terms.
+        then multiplies the state by the fourth-order Taylor polynomial of the matrix exponential.
+        The linear loop uses the same polynomial. Therefore only nonlinear terms can cause a
+        difference between the simulated loop and the linear loop.
         """
         if self.lin.dt:
             return self.rate
@@ -182,7 +186,7 @@ class Loop:
         return over
 
     def _judged(self, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
-        """Return each run's outcome, an index into OUTCOMES, and its relative prediction error.
+        """Return {"outcome": indices (N,) into OUTCOMES, "error": relative prediction errors (N,)}.
 
         `step` is the transition matrix of the linear loop from one history entry to the next. If it
         is None, runs are not compared with the linear loop.
@@ -208,8 +212,8 @@ def settle(
 ) -> dict[str, Array]:
     """Return the results of runs; diverging runs are repeated with shorter steps.
 
-    `runs_of(fine=k)` returns the job whose steps have been shortened k times. `starts` (N, nx) are
-    the initial deviations.
+    `runs_of(fine=k)` returns a job whose steps have been shortened k times. `starts` (N, nx)
+    contains the initial deviations.
     """
     arrays, left = dict[str, Array](), np.arange(len(starts))
     for fine in range(_FINEST + 1):

@@ -1,4 +1,4 @@
-"""Spreads of random values, given in Python or a TOML file, and their inverse distributions."""
+"""Spreads of random values, from Python or a TOML file, and inverse distribution functions."""
 
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
@@ -27,7 +27,7 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, object]):
-    """Dispersions {name, group or pattern: spread} from a file, with the lines of the file."""
+    """Dispersions {name, group or pattern: spread} from a TOML file, and the parsed file."""
 
     document: TomlFile
 
@@ -108,7 +108,10 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
 
 
 def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (name, spread) of a table; the key ``mass`` in ``base`` gives the name "base.mass"."""
+    """Yield (name, spread) for each entry of a table.
+
+    The entry ``mass`` of a nested table ``base`` has the name "base.mass".
+    """
     for key, value in table.items():
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
             yield from _names(value, f"{before}{key}.")
@@ -158,8 +161,9 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
 def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     """Return the inverse distribution function of a spread.
 
-    A number is a standard deviation; if `fixed`, all runs have this number as their value. The
-    functions of this module are `partial` objects. Functions of other objects can be slow.
+    A number is the standard deviation of a normal distribution; if `fixed`, it is the value of all
+    runs. A `partial` object is returned for a closed form of this module. Any other returned
+    function is the method `ppf` of a distribution, and can be slow.
     """
     if hasattr(spread, "ppf"):
         try:
@@ -205,6 +209,6 @@ def _normal(deviation: float, u: Array) -> Array:
     return normal
 
 
-# Inverse distribution of the noise seeds: whole numbers below 2^53, because the uniform values of
-# NumPy are multiples of 2^-53.
+# Inverse distribution function of the noise seeds. The seeds are whole numbers below 2^53, because
+# the uniform values of NumPy are multiples of 2^-53.
 SEEDS: Inverse = partial(np.multiply, 2.0**53)

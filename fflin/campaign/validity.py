@@ -233,7 +233,7 @@ def validity(
     levels = (np.arange(samples) + 0.5) / samples
 
     def displaced(levels: Array, streams: Indices) -> Array:
-        """Return the initial deviations of runs; one random stream gives one direction."""
+        """Return the initial deviations (N, nx) of runs; each random stream gives one direction."""
         x = []
         for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
@@ -284,7 +284,10 @@ def _report(progress: Progress, before: int, total: int, done: int, _: int) -> N
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the absolute error: one more than the order of the relative error."""
+    """Return the order of the absolute error in the displacement, or NaN if rounding hides it.
+
+    The order is one more than the order of the relative error, which is fitted.
+    """
     if not errors[:4].min() > _ROUNDING:
         return np.nan
     return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])
@@ -309,7 +312,7 @@ def _crossing(errors: Array) -> float:
 def _checked_displacement(
     lin: LinearModel, attitude: float, position: float, joint: float
 ) -> dict[str, float]:
-    """Return the largest displacement, with zeros for quantities that are not model states."""
+    """Return the largest displacement; it is 0 for a quantity that the model has no state of."""
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
     if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):
@@ -334,7 +337,7 @@ def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
 
 
 def joint_unit(lin: LinearModel) -> str:
-    """Return the unit of the joints; it is "rad|m" if the model has joints of both kinds."""
+    """Return the unit of the joints: "rad|m" if the model has revolute and prismatic joints."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
     of = {unit for name, unit in pairs if name.startswith("q_m.")}
     return of.pop() if len(of) == 1 else "rad|m"

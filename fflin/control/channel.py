@@ -98,15 +98,16 @@ def warn_beyond(
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
-    worst = ratio.argmax(axis=0)
+    worst, exceeded = ratio.argmax(axis=0), ratio.max(axis=0) > 1.0 + 1e-6
+    if not exceeded.any():
+        return
     beyond = [
         f"{name} requires {asked[row, k]:.3g} {unit}, its limit is {bounds[row, k]:g}"
         for k, ((name, unit), row) in enumerate(zip(units.items(), worst, strict=True))
-        if ratio[row, k] > 1.0 + 1e-6
+        if exceeded[k]
     ]
-    if beyond:
-        said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
-        warnings.warn(said, FflinWarning, stacklevel=3)
+    said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
+    warnings.warn(said, FflinWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def plan(
         raise InputError(f"free is {free!r}, expected a list of state names, such as ['r_b']")
     t, actuation = np.linspace(0.0, duration, knots), Actuation(state)
     shooting = Shooting(robot, t, hold == "previous")
-    acting = chosen_limits(robot, limits)[0]
+    acting = chosen_limits(robot, limits)
     low, high = input_limits(robot, acting)
     if R is None:
         size = np.maximum(np.abs(low), np.abs(high))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import compress
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -111,8 +112,7 @@ class StateFeedback(Feedback):
             If the robot has other states or inputs than the model. Masses may differ.
         """
         state = self.state_map(robot)
-        command = readout(state, *self.terms(state))
-        return lambda _, q, v: command(q, v)
+        return readout(state, *self.terms(state))
 
 
 @dataclass(eq=False)
@@ -122,8 +122,8 @@ class Allocation:
     The policy commands the inputs of the robot `design`, such as torque and force on the base. The
     thrusters and motors of the simulated robot then produce the generalised force that is closest
     to the commanded force, without negative thrust and without exceeding an input limit. The
-    distance between the two forces is the sum of squared differences between the accelerations that
-    they cause.
+    squared distance between the two forces is e^T M e. Here e is the difference between the
+    accelerations that the two forces cause, and M is the inertia of the robot.
 
     Parameters
     ----------
@@ -361,4 +361,4 @@ def fed_back(policy: object) -> tuple[str, ...]:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
     names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
     used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(names, used, strict=True) if size)
+    return tuple(compress(names, used))

@@ -1,4 +1,4 @@
-"""Coordinates of the state: names, units, axes, the attitude chart, and errors of states."""
+"""Coordinates of the state: names, units, axes, the attitude chart, and state errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
+from operator import attrgetter
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
@@ -23,11 +24,12 @@ if TYPE_CHECKING:
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
-# Frames of a circular orbit. If a robot is in orbit, one of them replaces the world frame.
+# Frames of a circular orbit. If a robot is in orbit, one of these frames replaces Pinocchio's world
+# frame.
 ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
-# For each frame, whether omega_b and v_b are expressed in reference axes instead of base axes. The
-# same axes apply to tau_b and F_b.
+# For each frame, two flags. The first is true if omega_b and tau_b are in reference axes, and false
+# if they are in base axes. The second flag is the same for v_b and F_b.
 IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "hybrid": (False, True),
     "local": (False, False),
@@ -35,14 +37,20 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     **dict.fromkeys(ORBITAL, (False, True)),
 }
 
-# Rows of the base's angular and linear parts in a velocity or force (6 + n,) in state order.
+# Entries of the base's angular part and linear part in vectors (6 + n,) in state order: velocities
+# and generalised forces.
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# The same rows in Pinocchio's v and spatial vectors.
+# Entries of the same two parts in Pinocchio's v and spatial vectors, in which the linear part is
+# first.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
-    """Return the given or default frame; raise `InputError` if it contradicts the orbit."""
+    """Return the frame, or the default frame of the robot if `frame` is None.
+
+    Raise `InputError` for an unknown frame, for an orbital frame without an orbit, and for another
+    frame in orbit.
+    """
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
@@ -57,7 +65,7 @@ def frame_of(robot: Robot, frame: object) -> Frame:
 
 
 def refuse_orbit(robot: Robot, what: str) -> None:
-    """Raise `InputError` if a robot is in orbit; `what` names the unsupported feature."""
+    """Raise `InputError` if a robot is in orbit; `what` names the feature that is unsupported."""
     if getattr(robot, "orbit", None):
         raise InputError(
             f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
@@ -66,7 +74,7 @@ def refuse_orbit(robot: Robot, what: str) -> None:
 
 
 class Groups(NamedTuple):
-    """Slices of the six groups of the state."""
+    """Slices of the state (1.1), one for each of its six vectors."""
 
     q_b: slice
     r_b: slice
@@ -77,7 +85,7 @@ class Groups(NamedTuple):
 
 
 def _axes_of(**units: str) -> dict[str, str]:
-    """Return the names and units of the x, y and z components of vectors as {name: unit}."""
+    """Return {component: unit} for the x, y and z components of the vectors in {vector: unit}."""
     return {f"{name}.{axis}": unit for name, unit in units.items() for axis in "xyz"}
 
 
@@ -85,7 +93,7 @@ _POSE, _TWIST = _axes_of(q_b="1", r_b="m"), _axes_of(omega_b="rad/s", v_b="m/s")
 
 
 def state_units(robot: Robot) -> dict[str, str]:
-    """Return the names and units of the 12 + 2n states as {name: unit}."""
+    """Return {name: unit} of the 12 + 2n states, in state order."""
     q_m, qdot_m = dict[str, str](), dict[str, str]()
     for joint in robot.joints:
         unit = joint.unit
@@ -94,7 +102,7 @@ def state_units(robot: Robot) -> dict[str, str]:
 
 
 def forces_of(robot: Robot) -> dict[str, str]:
-    """Return the names and units of the 6 + n generalised forces as {name: unit}."""
+    """Return {name: unit} of the 6 + n generalised forces, in state order."""
     tau_m = {f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints}
     return _axes_of(tau_b=BaseTorque.UNIT, F_b=BaseForce.UNIT) | tau_m
 
@@ -108,9 +116,13 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True)
 class Chart:
-    """Attitude chart at one or many base attitudes relative to the reference."""
+    """Attitude chart of section 1, evaluated at one or many attitudes of the base.
 
-    standing: ClassVar[bool] = False  # whether the base has the reference attitude
+    The attitudes are relative to the reference. refMb is the placement of the base relative to the
+    reference.
+    """
+
+    standing: ClassVar[bool] = False  # whether all attitudes are equal to the reference
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # scalar part (.., 1) of this quaternion, positive
@@ -118,7 +130,7 @@ class Chart:
 
     @classmethod
     def of(cls, quaternion: Array) -> Chart:
-        """Return the chart at unit quaternions (.., 4) of refMb; their sign is arbitrary."""
+        """Return the chart at unit quaternions (.., 4) of refMb, each of arbitrary sign."""
         if quaternion.ndim == 1:
             quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
             return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
@@ -127,51 +139,61 @@ class Chart:
 
     @cached_property
     def N(self) -> Array:
-        """N = Q / 2 (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
+        """Matrix N = Q / 2 (.., 3, 3) of d q_b/dt = N omega, with omega in base axes (1.2)."""
         return 0.5 * (np.asarray(self.q0)[..., None] * _IDENTITY + skew(self.q_b))
 
     @cached_property
     def J(self) -> Array:
-        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
+        """Matrix J (.., 3, 3) of ``d theta = J d q_b``, with d theta in base axes (1.3)."""
         # Q^-1 = Q^T + q_b q_b^T / q0.
         return 2.0 * (2.0 * self.N.mT + self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def rate(self, omega: Array) -> Array:
-        """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
+        """Return d q_b/dt (.., 3) for the angular velocity omega (.., 3) in base axes (1.2)."""
         return 0.5 * omega if self.standing else times(self.N, omega)
 
     def turned(self, columns: Array) -> Array:
-        """Rotate columns (.., 3, k) from base axes to reference axes."""
+        """Return k vectors, the columns (.., 3, k) in base axes, in reference axes."""
         return columns if self.standing else product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
-        """Return the derivative (.., 3, 3) of `rate` over q_b (4.2); `crossed` is [omega]x."""
+        """Return the derivative (.., 3, 3) of d q_b/dt with respect to q_b (4.2).
+
+        omega is in base axes and constant, and `crossed` is [omega]x.
+        """
         if self.standing:
             return -0.5 * crossed
         return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Convert derivatives (.., k, 3) over base rotations to derivatives over q_b (1.3)."""
+        """Convert derivatives (.., k, 3) from small base rotations d theta to q_b (1.3)."""
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply parts of x (.., m, k), which have three rows each, by R in place.
+        """Multiply some blocks of x (.., m, k) by R from the left, in place.
 
-        The transpose of a matrix is given to multiply parts of three columns by R^T from the right.
+        `parts` are the slices of the three rows of each block. To multiply blocks of three columns
+        by R^T from the right, callers pass the transpose of the matrix.
         """
         _turn(self.R, () if self.standing else parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with some parts (three rows each) rotated by R to reference axes."""
+        """Return x (.., m, k) with the rows of `parts` (three rows each) in reference axes.
+
+        In the given x, these rows are in base axes.
+        """
         return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with some parts (three rows each) rotated by R^T to base axes."""
+        """Return x (.., m, k) with the rows of `parts` (three rows each) in base axes.
+
+        In the given x, these rows are in reference axes.
+        """
         return x if self.standing or not parts else _turn(self.R.mT, parts, x.copy("K"))
 
 
 class Standing(Chart):
-    """Chart at one or many attitudes equal to the reference: R = Q = I and J = 2 I."""
+    """Chart at one or many attitudes that are equal to the reference: R = Q = E and J = 2 E."""
 
     standing = True
 
@@ -194,14 +216,18 @@ _TURN = 2.0 * np.pi
 
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
-    """Return the states (.., nx) at valid q (.., nq) and nu (.., 6 + n); nu is in base axes."""
+    """Return the states (.., nx) at q (.., nq) and at nu (.., 6 + n) in base axes.
+
+    The arguments are not checked.
+    """
     return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
 
 
 def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
-    """Remove full turns of continuous joints from states or errors (.., nx), in place.
+    """Remove full turns of continuous joints from states or state errors x (.., nx), in place.
 
-    Afterwards each angle is within half a turn of its value in `near` (nx,).
+    Afterwards, the angle of each continuous joint is within half a turn of its value in `near`
+    (nx,), or of the number `near`. Return x.
     """
     joints = 6 + state.unbounded
     apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
@@ -211,22 +237,26 @@ def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
 
 def readout(
     state: StateMap, K: Array, offset: Array, near: Array
-) -> Callable[[Array, Array], Array]:
-    """Return the function f(q, v) = offset - K x(q, v); x has the angles nearest to `near`."""
-    # q_b is linear in the quaternion of q, r_b is linear in the position of q, and velocities in
-    # reference axes are linear in R v. So f is one matrix-vector product. It takes a fifth of the
-    # time of computing x.
+) -> Callable[[float, Array, Array], Array]:
+    """Return the law u(t, q, v) = offset - K x(q, v), which a policy evaluates at each sample.
+
+    In the state x, the angles of continuous joints are within half a turn of `near` (nx,).
+    """
+    # The state x is linear in the vector z below. So u is one matrix-vector product, which takes a
+    # fifth of the time of computing x.
     robot, g = state.robot, state.groups
-    idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
+    idx_q = np.array([*map(attrgetter("idx_q"), robot.joints)], dtype=np.intp)
+    scales = np.array([*map(attrgetter("scale"), robot.joints)])
     circling, cos = state.unbounded, idx_q[state.unbounded]
     middle = near[g.q_m][circling]
-    # x = S z, where z stacks q, v, the angles of continuous joints, R omega, R v and 1.
+    # x = S z, where z stacks q, v, the angles of continuous joints, omega_b and v_b in world axes,
+    # and 1.
     ends = np.cumsum((robot.nq, robot.nv, len(circling), 3, 3))
     S = np.zeros((state.nx, ends[-1] + 1))
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(S, ends, axis=1)
     at, turn = state.origin, turning.product_matrix(state.origin_quaternion)
     of_q[g.q_b, 3:7], of_q[g.r_b, :3], constant[g.r_b, 0] = turn[:3], at.rotation, at.translation
-    of_q[g.q_m][np.arange(robot.n), idx_q] = [1.0 / joint.scale for joint in robot.joints]
+    of_q[g.q_m][np.arange(robot.n), idx_q] = 1.0 / scales
     of_q[:, cos] = 0.0
     of_angles[6 + circling] = np.eye(len(circling))
     of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
@@ -241,7 +271,7 @@ def readout(
     z_turn, scalar = z_q[3:7], turn[3]
     turned_angular, turned_linear = state.axes
 
-    def f(q: Array, v: Array) -> Array:
+    def law(_: float, q: Array, v: Array) -> Array:
         z_q[:], z_v[:] = q, v
         if scalar.dot(z_turn) < 0.0:
             z_turn[:] = -z_turn
@@ -255,15 +285,18 @@ def readout(
                 z_angular[:] = R.dot(v[3:6])
         return gains.dot(z)
 
-    return f
+    return law
 
 
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion, with angles unwrapped, starting near `near` (nx,)."""
-    # If the times t (N,) are given, the joint rates determine how many turns lie between two rows.
-    # Otherwise, an angle is assumed to change by less than half a turn between rows.
+    """Return the states (N, nx) of a motion, with the angles of continuous joints unwrapped.
+
+    The first angles are within half a turn of `near` (nx,), or of 0 if `near` is None.
+    """
+    # If the times t (N,) are given, the joint rates determine how many turns a joint makes from one
+    # row to the next. Otherwise, the angle is assumed to change by less than half a turn.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -278,14 +311,20 @@ def state_history(
 
 
 def attitude_errors(x: Array, target: Array) -> Array:
-    """Return the angles (N,) [deg] between the attitudes of states and one or N targets."""
+    """Return the angles (N,) [deg] between the attitudes of states x (N, nx) and of targets.
+
+    `target` is one state (nx,) for all rows of x, or one state for each row (N, nx).
+    """
     turned, scalar = _apart(x, target)
     angles: Array = 2.0 * np.arctan2(np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0]))
     return np.degrees(angles)
 
 
 def _apart(x: Array, target: Array) -> tuple[Array, Array]:
-    """Return the quaternion from target to x as vector (N, 3) and scalar (N, 1)."""
+    """Return the quaternions of the rotations from the attitudes of `target` to those of x.
+
+    The result is their vector parts (N, 3) and scalar parts (N, 1).
+    """
     at, to = x[:, :3], target[..., :3]
     w, d = (
         np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
@@ -295,7 +334,12 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
 
 
 def moving_errors(frame: str, x: Array, target: Array) -> Array:
-    """Return the errors (N, nx) of states from moving targets, in the axes of the targets (9.5)."""
+    """Return the errors (N, nx) of states x (N, nx) from moving targets (5.1).
+
+    Each target (nx,) is a state, whose base axes are the target axes. Attitude and position errors
+    are in target axes. A velocity error is the velocity of the state in its own base axes minus the
+    velocity of the target in target axes.
+    """
     e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
     turned, scalar = _apart(x, target)
     e[:, :3] = turned * np.where(scalar < 0.0, -1.0, 1.0)
@@ -306,7 +350,11 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 
 
 def moved_by(frame: str, target: Array, e: Array) -> Array:
-    """Return the states (N, nx) with errors e from a target; NaN if |q_b| of e exceeds 1."""
+    """Return the states (N, nx) whose errors from targets (N, nx) are e (N, nx).
+
+    This function is the inverse of `moving_errors`. If an error has |q_b| > 1, the attitude in its
+    row is NaN.
+    """
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
     x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
@@ -321,19 +369,23 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 
 
 def _turned(x: Array) -> tuple[Array, Array]:
-    """Return the nonnegative quaternion scalar (N, 1) and the rotation (N, 3, 3) of each state."""
+    """Return the quaternion scalar q0 >= 0 (N, 1) and the rotation matrix (N, 3, 3) of states."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the indices of the base velocities that the frame expresses in reference axes."""
+    """Return the state indices (3,) of each base velocity that `frame` has in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 
 
 def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
-    """Return the error (nx,) from a moving reference, in the axes of the reference."""
+    """Return the error (nx,) of (q, v) from a moving reference (q_star, v_star), as in (5.1).
+
+    Attitude and position errors are in the axes of the reference. The velocity error is v - v_star
+    in state order, where v is in base axes and v_star is in the axes of the reference.
+    """
     g = state.groups
     e = np.empty(state.nx)
     turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])

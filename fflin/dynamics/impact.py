@@ -1,4 +1,4 @@
-"""Impacts: instant changes of a robot, such as a jammed joint, and the velocities after them."""
+"""Impacts: instant changes of a robot by a grasp or a jammed joint, and the velocities after."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -153,7 +153,12 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> Impact:
-    """Join robots at (q, v) to one robot (13.1); return generalised impulses on the parts."""
+    """Return the impact after which `parts` (robot, q, v) move together as the robot `whole`.
+
+    The velocity solves (13.1). The `impulse` of the result stacks M times the lost velocity of each
+    part in Pinocchio's order, which is minus the generalised impulse on this part. The names of the
+    second part begin with `prefix` in `whole`.
+    """
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
@@ -190,12 +195,12 @@ def struck(
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
-    """Return the joint-space inertia M (nv, nv) for Pinocchio's v."""
+    """Return the joint-space inertia M (nv, nv) at a configuration, in the order of v."""
     return np.asarray(pin.crba(robot.model, robot.create_data(), q.copy()))
 
 
 def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
-    """Return (linear, angular) momentum (6,) about the world's origin, in world axes."""
+    """Return the momentum (6,) in world axes: linear, then angular about the world's origin."""
     data = robot.create_data()
     pin.computeCentroidalMomentum(robot.model, data, q, v)
     linear, angular = data.hg.linear, data.hg.angular + np.cross(data.com[0], data.hg.linear)
@@ -203,7 +208,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> pin.JointModel:
-    """Return the joint with a name in Pinocchio's model."""
+    """Return Pinocchio's joint of a robot by its name."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 
@@ -365,7 +370,11 @@ def capture(
 
 
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
-    """Return a payload's checked configuration and velocity, with its base at a given placement."""
+    """Return the checked configuration and velocity of a payload, with its base placed at `at`.
+
+    `at` is a placement in the world. If q is None, the joints are neutral. If v is None, the
+    payload is at rest. If v is a twist (6,), the joints are at rest.
+    """
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))

@@ -1,4 +1,4 @@
-"""Integrators: fixed steps on the configuration manifold, and exact samples of linear models."""
+"""Integrators: fixed steps on the configuration manifold, and exact sampling of linear models."""
 
 import math
 from collections.abc import Callable
@@ -17,28 +17,31 @@ _integrate = pin.integrate
 
 
 def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
-    """Displace configurations (N, nq) by tangent vectors (N, nv), and return the results."""
+    """Return the configurations (N, nq) displaced by the tangent vectors `way` (N, nv)."""
     return np.array([*map(partial(_integrate, model), q, way)])
 
 
 class Integrator:
-    """Integrator of one model with a fixed step size, for one point or for N rows of points."""
+    """Integrator with a fixed step size for one model. It steps one q and v, or N rows of them."""
 
-    # Times of the stages in a step of length 1.
+    # A step of length h starts at q and v. Its stages evaluate the accelerations l1, l2, ...
+    # Times of the stages for h = 1.
     nodes: ClassVar[tuple[float, ...]]
-    # Quadrature weights of the stages: a step ends at v + h sum(weights a).
+    # Weights of l1, l2, ... in the integral of the acceleration: the step changes v by h times the
+    # weighted sum.
     weights: ClassVar[tuple[float, ...]]
-    # Weights of the double integral: a free position r ends at r + h v + h^2 sum(moments a).
+    # Weights of l1, l2, ... in the double integral of the acceleration: the step changes the
+    # position of a point by h v plus h^2 times the weighted sum.
     moments: ClassVar[tuple[float, ...]]
-    # Stability limit on the negative real axis: largest |pole| h.
+    # Stability limit: the largest stable h |pole| of a negative real pole.
     reach: ClassVar[float]
-    # Stage from whose configuration each displacement starts: 0 for the first stage (the beginning
-    # of the step), 1 for the second.
+    # After each stage, a displacement leads to the next configuration. The displacement starts from
+    # the configuration of the stage with this index: 0 for the first stage, 1 for the second.
     origins: ClassVar[tuple[int, ...]]
-    # Weights of h v, h^2 l1, h^2 l2, ... in the displacement to each new q. Here v is the velocity
-    # at the beginning of the step, and l1, l2, ... are the accelerations of the stages.
+    # Weights of h v, h^2 l1, h^2 l2, ... in each displacement. The last displacement starts from
+    # the result of the displacement before it.
     displacements: ClassVar[tuple[tuple[float, ...], ...]]
-    # Weights of v, h l1, h l2, ... in each new velocity.
+    # Weights of v, h l1, h l2, ... in the velocity after each stage.
     speeds: ClassVar[tuple[tuple[float, ...], ...]]
 
     def __init__(self, model: pin.Model, dt: float, rows: int | None = None) -> None:
@@ -50,7 +53,11 @@ class Integrator:
 
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
-        """Return the weights of v, l1, l2, ... for each new q and new velocity in a step of dt."""
+        """Return the weights of v, l1, l2, ... for a step of dt [s].
+
+        The rows of the first result are the displacements of q, and the rows of the second result
+        are the new velocities.
+        """
         displacement, speed = np.array(cls.displacements), np.array(cls.speeds)
         displacement[:, 0] *= dt
         displacement[:, 1:] *= dt * dt
@@ -58,7 +65,7 @@ class Integrator:
         return displacement, speed
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v one step later."""
+        """Return q and v one step later; `f(t, q, v)` returns the acceleration."""
         model, stages, begins = self.model, self._stages, list[Array]()
         integrate = self._integrate
         stages[..., 0, :] = v
@@ -74,7 +81,10 @@ class Integrator:
 
 
 class CommutatorFree4(Integrator):
-    """CF4 of Celledoni, Marthinsen and Owren: order 4, two exponentials at the end (11.1)."""
+    """Commutator-free method CF4 of Celledoni, Marthinsen and Owren, of order 4 (11.1).
+
+    Two exponentials, one after the other, lead to the configuration at the end of a step.
+    """
 
     nodes = (0.0, 0.5, 0.5, 1.0)
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
@@ -97,7 +107,7 @@ class CommutatorFree4(Integrator):
 
 
 class SemiImplicitEuler(Integrator):
-    """Semi-implicit Euler: order 1; the configuration moves with the new velocity."""
+    """Semi-implicit Euler method of order 1: the new velocity displaces the configuration."""
 
     nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
@@ -112,14 +122,15 @@ INTEGRATORS: dict[str, type[Integrator]] = {
 
 
 def integrator(name: str) -> type[Integrator]:
-    """Return the integrator with a name, or raise `UnknownNameError`."""
+    """Return the integrator of a given name; raise `UnknownNameError` if there is none."""
     if str(name) not in INTEGRATORS:
         raise unknown("method", str(name), INTEGRATORS)
     return INTEGRATORS[str(name)]
 
 
-# Commutator-free method of order four (10.3): its Gauss nodes, and the nodes' weights in the first
-# of the two exponentials. The second exponential has the weights in reverse order.
+# Commutator-free method of order four (10.3): its two Gauss points, and the weights alpha (HEAVY)
+# and beta (LIGHT). In the first exponential, the first Gauss point has the weight HEAVY. In the
+# second exponential, the second Gauss point has this weight.
 GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
@@ -127,7 +138,7 @@ HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, Array]:
     r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) with B = `driven`.
 
-    A, B and h may have leading axes: matrices (.., n, n) and (.., n, k), and times (..).
+    A (.., n, n), B (.., n, k) and the time h (..) [s] may have leading axes.
     """
     n, k = driven.shape[-2:]
     h = np.asarray(h)[..., None, None]
@@ -145,8 +156,12 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
 def held_derivatives(
     A: Array, driven: Array, h: float, dA: Array, d_driven: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives of `held_exponential` along dA (.., n, n) and d_driven (.., n, k)."""
-    # The derivative of x obeys d(dx)/dt = A dx + dA x + d_driven u, a linear system in (dx, x).
+    """Return the changes of both results of `held_exponential`, to first order.
+
+    dA (.., n, n) is the change of A, and d_driven (.., n, k) is the change of `driven`.
+    """
+    # The change dx of x satisfies d(dx)/dt = A dx + dA x + d_driven u. With dx/dt = A x + driven u,
+    # this is a linear system with the state (dx, x).
     n = len(A)
     both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
     both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
@@ -157,8 +172,8 @@ def held_derivatives(
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     """Return the integral of e^(F' t) W e^(F t) over [0, h]; F and h may have leading axes."""
-    # The rounding error of an exponential is relative to its largest block, so W is scaled to the
-    # size of F.
+    # In a matrix exponential, the rounding errors of all blocks are relative to the largest block.
+    # So W is scaled to the size of F.
     from scipy.linalg import expm
 
     h, n = np.asarray(h)[..., None, None], F.shape[-1]

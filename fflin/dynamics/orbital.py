@@ -1,4 +1,4 @@
-"""Frame of a circular orbit: relative rates, and the gravity-gradient field (14.1)."""
+"""Frame of a circular orbit: velocities relative to it, and the gravity-gradient field (14.1)."""
 
 import math
 import warnings
@@ -14,8 +14,8 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# For each frame: the unit vector away from the central body, and the unit vector along the orbit's
-# normal.
+# For each orbital frame, two unit vectors in its axes: the direction away from the central body,
+# and the orbit normal.
 _AXES = {
     "hill": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "lvlh": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
@@ -27,17 +27,21 @@ def mean_motion(robot: Robot) -> float:
     return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
-# Relative errors of the linear gravity field: the first causes a warning, the second an error.
+# Limits of the relative error of the linear gravity field (14.1). Above _COARSE, a warning is
+# given. Above _USELESS, an error is raised.
 _COARSE, _USELESS = 0.01, 0.5
 
 
 class OrbitField:
-    """Acceleration field of a circular orbit in its rotating frame.
+    """Accelerations of masses in the rotating frame of a circular orbit.
 
-    The frame rotates with `rate` (3,) [rad/s]. At a position x, the gravity gradient per unit mass
-    is `tide` x. A point at rest in the frame has the acceleration `pull` x. The matrix `pull` is
-    equal to n^2 (3 r r^T - z z^T). The columns of `axes` (3, 3) are the unit vectors away from the
-    central body, along the orbit and along its normal.
+    - `rate` (3,): angular velocity of the frame [rad/s].
+    - `tide` (3, 3): matrix G of (14.1). At a position x, gravity per unit mass minus gravity at the
+      frame's origin is `tide` x.
+    - `pull` (3, 3): matrix K of (14.2). A free mass that is at rest in the frame at x has the
+      acceleration `pull` x relative to the frame.
+    - `axes` (3, 3): its columns are three unit vectors: away from the central body, along the
+      orbit, and along the orbit normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
@@ -61,12 +65,16 @@ class OrbitField:
         self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))
 
     def base(self, q: Array) -> tuple[Array, Array]:
-        """Return attitude (3, 3) and position (3,) of the base."""
+        """Return the attitude (3, 3) and position (3,) of the base in the orbital frame."""
         base = self._root * pin.XYZQUATToSE3(q[:7])
         return base.rotation, base.translation
 
     def require_near(self, q: Array) -> None:
-        """Warn or raise an error if the robot may reach far from the origin of the orbit frame."""
+        """Check that the robot is near the origin of the orbital frame, where (14.1) is accurate.
+
+        If the robot may extend too far, give a warning. If it may extend much too far, raise
+        `InputError`.
+        """
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
         message = (
@@ -79,7 +87,10 @@ class OrbitField:
             warnings.warn(message, FflinWarning, stacklevel=7)
 
     def absolute(self, q: Array, v: Array) -> Array:
-        """Return the inertial velocity (nv,) for a velocity v relative to the orbital frame."""
+        """Return the inertial velocity (nv,) for the velocity v relative to the orbital frame.
+
+        v and the result are in Pinocchio's order.
+        """
         R, position = self.base(q)
         found = v.copy()
         found[PIN_LINEAR] += R.T @ (self._turning @ position)
@@ -87,31 +98,39 @@ class OrbitField:
         return found
 
     def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
-        """Return the relative acceleration dv/dt (nv,) from the inertial acceleration (14.2)."""
+        """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2).
+
+        `absolute` (nv,) is the inertial velocity, and `rate` (nv,) is its time derivative.
+        """
         frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
         found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
         found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
         return found
 
     def wrenches(self, data: pin.Data) -> list[pin.Force]:
-        """Return the gravity-gradient wrench on each body, in its joint's frame."""
+        """Return the gravity-gradient wrench on each body, in the frame of the body's joint.
+
+        The first wrench, on Pinocchio's universe, is zero.
+        """
         R, center = self._bodies(data)
         back = R.swapaxes(1, 2)
         force = self._mass * (back @ (self.tide @ center))[..., 0]
-        # The skew-symmetric matrix I `tide` - `tide` I, in body axes, contains the three entries of
-        # the torque 3 n^2 r x (I r).
+        # With the inertia I of a body and `tide` in body axes, the matrix I `tide` - `tide` I is
+        # [t]x of the torque t = 3 n^2 r x (I r).
         turn = self._inertia @ (back @ self.tide @ R)
         turn -= turn.swapaxes(1, 2)
         torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the derivatives (nv, nv) over q of the generalised force that `wrenches` cause.
+        """Return the derivatives (nv, nv) of the generalised force of `wrenches` over q.
 
-        The origin of the base is fixed.
+        Only the wrenches vary with q. The Jacobians of the bodies are held constant, because the
+        ABA derivatives include their change. The derivatives over the base position are zero here,
+        because `add_turning` adds the effect of this position.
         """
-        # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body changes T
-        # by T [t]x - [t]x T.
+        # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body, in its
+        # own axes, changes T by T [t]x - [t]x T.
         model, (R, centers) = self.robot.model, self._bodies(data)
         joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
         J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
@@ -130,21 +149,27 @@ class OrbitField:
         return total
 
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and the inertial v with the base at the frame's origin and zero linear velocity.
+        """Return q and the inertial v for the same robot with its base at the frame's origin.
 
-        Base position and linear velocity do not affect motion relative to the base's free fall.
+        The linear velocity of the base is zero in the result. Position and linear velocity of the
+        base do not affect the motion of the robot relative to the free fall of the base's origin.
         """
         q, v = q.copy(), self.absolute(q, v)
         q[:3] = v[PIN_LINEAR] = 0.0
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Convert derivatives at `near` to derivatives of the relative acceleration, in place."""
+        """Convert derivatives of inertial accelerations to derivatives of the relative ones.
+
+        The given `by_q` and `by_v` hold at the point that `near` returns for q and v. They are
+        changed in place to the derivatives of (14.2) at q and v.
+        """
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # The next lines differentiate the relative accelerations. They are dw/dt + w x spin, with
-        # the inertial dw/dt, and c + fall - 2 spin x v - w x v.
+        # The next lines differentiate the relative accelerations (14.2). With the inertial
+        # acceleration (c_w, c_v) at `near`, they are c_w + w x spin and
+        # c_v + fall - 2 spin x v - w x v.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -155,9 +180,12 @@ class OrbitField:
         by_v[LINEAR, LINEAR] -= 2.0 * spin + W
 
     def potential(self, data: pin.Data) -> float:
-        """Return the potential energy [J] of the gravity gradient and the frame's rotation."""
-        # In the rotating frame, the potential energy is -1/2 times the integral of x^T G x over the
-        # mass of the robot, with G = `pull`.
+        """Return the potential energy [J] of a robot without springs in the orbital frame (14.3).
+
+        It includes the term of wheels that are modelled by a constant momentum.
+        """
+        # Without these wheels, the potential energy is -1/2 times the integral of x^T G x over the
+        # mass of the robot. The matrix G of this function is `pull`, which is K in (14.3).
         R, center = self._bodies(data)
         G, inertia = self.pull, self._inertia
         second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
@@ -168,15 +196,18 @@ class OrbitField:
         return energy
 
     def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
-        """Return the attitude (k, 3, 3) and the centre of mass (k, 3, 1) of each of k bodies."""
+        """Return the attitudes (k, 3, 3) and the centres of mass (k, 3, 1) of the k bodies.
+
+        Both are in the orbital frame.
+        """
         placements = data.oMi.tolist()[ROOT:]
         R = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])
         return R, origins[..., None] + R @ self._lever
 
 
-# Weights, divided by n^2, of the rotations about the radial direction, the direction of flight and
-# the normal.
+# Weights of (14.4), divided by n^2, of the rotations about the radial direction, the direction of
+# flight and the orbit normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 
 
@@ -184,8 +215,8 @@ class GravityGradient(NamedTuple):
     """Gravity-gradient field of an orbit at one base pose, in base axes.
 
     A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x. The
-    field n^2 (3 r r^T - I) x is the sum of three such terms. Their weights are 2 n^2 for the radial
-    direction, -n^2 for the direction of flight and -n^2 for the normal.
+    field n^2 (3 r r^T - E) x is a weighted sum of three such accelerations (14.4). The weights are
+    2 n^2 for the radial direction, -n^2 for the direction of flight and -n^2 for the orbit normal.
     """
 
     turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation
@@ -194,7 +225,7 @@ class GravityGradient(NamedTuple):
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
-        """Return the field at a configuration (nq,), which must be near the frame's origin."""
+        """Return the field at the base pose of a configuration (nq,), after `require_near`."""
         field.require_near(q)
         R, position = field.base(q)
         n = mean_motion(field.robot)
@@ -202,9 +233,11 @@ class GravityGradient(NamedTuple):
         return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ position))
 
     def force(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array, Array]:
-        """Return the generalised force (nv,) relative to the free fall of the base's origin.
+        """Return the generalised force P (nv,) of the field at q, with its derivatives (14.4).
 
-        Return also its derivatives over q (nv, nv) and over base rotations (nv, 3).
+        The base of q must be at the origin, so that P excludes the free fall of the base's origin.
+        The derivatives are (nv, nv) over q, with the field constant in base axes, and (nv, 3) over
+        rotations of the base.
         """
         total, v, at_rest = np.zeros((3, model.nv))
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))

@@ -1,4 +1,4 @@
-"""Outputs of a robot: their names, units, and two independent evaluations."""
+"""Outputs of a robot: names, units, and two independent computations of their values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Sensed(NamedTuple):
-    """Outputs and their derivatives (ny, nv) at a point; rows of outputs that are states are 0."""
+    """Outputs y (ny,) and their derivatives (ny, nv) at a point.
+
+    The rows of outputs that are states are zero. `Sensing.states` lists these rows.
+    """
 
     y: Array
     by_q: Array  # over the tangent displacement of pin.integrate
@@ -29,14 +32,14 @@ class Sensed(NamedTuple):
     by_a: Array  # over the acceleration a
 
     def part(self, rows: slice) -> Sensed:
-        """Return views of the rows of one output."""
+        """Return views of some rows, such as the rows of one output."""
         return Sensed(*(each[rows] for each in self))
 
 
 class Point(NamedTuple):
-    """Robot with its base moved to the origin and its linear base velocity set to zero.
+    """Robot with its base moved to the world's origin and the linear velocity of its base removed.
 
-    R, r_b and v_b are the pose and the linear velocity of the base before this change.
+    R, r_b and v_b are the attitude, position and linear velocity of the base before this change.
     """
 
     model: pin.Model
@@ -47,27 +50,28 @@ class Point(NamedTuple):
     r_b: Array  # position (3,) of the base relative to the reference
     v_b: Array  # velocity (3,) of the base's origin in base axes
     g: Array  # gravity (3,) in base axes
-    # Angular momentum of wheels without a joint: (joint on which it is mounted, momentum (3,) in
-    # the joint's axes).
+    # For each wheel that is modelled without a joint of its own: the joint on which the wheel is
+    # mounted, and the angular momentum (3,) of the wheel in the axes of this joint.
     stored: tuple[tuple[int, Array], ...]
     spin: Array  # (3,) angular velocity of the orbit frame in base axes
 
     def placement(self, frame: Carried) -> pin.SE3:
-        """Return the placement of a frame on the robot."""
+        """Return the placement of a frame of the moved robot in the world."""
         return self.data.oMi[frame.joint] * frame.placement
 
     def jacobian(self, frame: Carried) -> Array:
-        """Return the Jacobian (6, nv) of a frame in its own axes."""
+        """Return the Jacobian (6, nv) of a frame of the robot, in the axes of this frame."""
         of_frame = pin.getFrameVelocityDerivatives(self.model, self.data, *frame, _LOCAL)
         return np.asarray(of_frame[1])
 
 
-# f(point, sensed, *frames) writes outputs and derivatives into `sensed`. Functions with frames
-# require that pin.computeForwardKinematicsDerivatives was called; functions without frames call
-# the Pinocchio functions that they need.
+# A function `f(point, sensed, *frames)` that writes outputs and their derivatives into `sensed`. A
+# function with frames reads the results of `pin.computeForwardKinematicsDerivatives`, which its
+# caller must call first. A function without frames calls all Pinocchio functions that it needs.
 Derivatives: TypeAlias = Callable[..., None]
 
-# f(measuring, attitudes of the frames at the point of linearisation, *frames) returns the output.
+# A function `f(measuring, attitudes, *frames)` that returns an output. `attitudes` are the rotation
+# matrices of the frames at the operating point.
 Value: TypeAlias = Callable[..., Array]
 
 
@@ -83,8 +87,8 @@ def _center_of_mass(world: Measuring, _: object) -> Array:
 
 
 def _momentum_derivatives(at: Point, to: Sensed) -> None:
-    # Pinocchio also differentiates the rate of momentum, which needs an acceleration. This
-    # derivative is not used here, so v is given in place of the acceleration.
+    # The last argument is an acceleration. It affects only the derivatives of dh/dt, which are not
+    # used here, so v is given in its place.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, h = pin.computeTotalMass(at.model), at.data.hg
     to.y[:3] = at.R.dot(h.angular)
@@ -109,7 +113,8 @@ def _momentum(world: Measuring, _: object) -> Array:
 
 
 def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) -> None:
-    # The pose of a frame relative to another frame, or to the reference if there is no other frame.
+    # The output is the pose of `frame` relative to the frame `other`, or relative to the reference
+    # if there is no other frame.
     origin = at.placement(*other).inverse() if other else pin.SE3(at.R, at.r_b)
     relative, jacobian = origin * at.placement(frame), at.jacobian(frame)
     R, p = relative.rotation, relative.translation
@@ -134,8 +139,8 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    # A velocity that is constant in the axes of the frame or of the base rotates with these axes.
-    # The skew terms are its derivatives with respect to the rotation of the axes.
+    # The first term of the velocity is computed in the axes of the frame, and v_b in base axes. The
+    # skew terms are the derivatives with respect to rotations of these axes.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
@@ -168,13 +173,15 @@ def _gyroscope(world: Measuring, _: object, frame: Carried) -> Array:
 
 
 def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
-    # `Sensing.evaluate` sets the base's acceleration to dv_b/dt + omega_b x v_b - g in base axes.
+    # `Sensing.evaluate` has set the linear acceleration of the base to
+    # dv_b/dt + omega_b x v_b - g in base axes.
     _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
         at.model, at.data, *frame, _LOCAL
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
-    # Derivatives of omega_b x v_b and of -g, which is constant in world axes.
+    # These two terms are the derivatives of -g, which is constant in world axes, and of
+    # omega_b x v_b.
     of_base = by_a[:, PIN_LINEAR]
     to.by_q[:, PIN_ANGULAR] -= of_base.dot(skew(at.g))
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
@@ -187,7 +194,7 @@ def _accelerometer(world: Measuring, _: object, frame: Carried) -> Array:
     return np.asarray(acceleration - world.placement(frame).rotation.T @ world.gravity)
 
 
-# All types of outputs that are not listed here consist of states.
+# Outputs of all types that are not listed here are states.
 KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
     kinds.CenterOfMass: (_center_of_mass_derivatives, _center_of_mass),
     kinds.Momentum: (_momentum_derivatives, _momentum),
@@ -199,21 +206,21 @@ KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
 }
 
 
-# Rotation and position of a base at its reference.
+# Attitude and position of a base that is at the reference.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
     """Outputs of a robot and their derivatives.
 
-    With `own_reference`, the outputs are relative to the base's current pose.
+    The outputs are relative to the reference, or relative to the current pose of the base if
+    `own_reference` is true.
     """
 
-    # Motion relative to the base does not depend on the base's position and velocity (Galilean
-    # invariance). So Pinocchio evaluates the robot with its base at the origin and v_b = 0, and
-    # the base motion is added afterwards. This loses no digits at orbital positions and
-    # velocities. Sensors measure the base's acceleration as dv_b/dt + omega_b x v_b - g in base
-    # axes.
+    # Motion relative to the base does not depend on the base's position and linear velocity
+    # (Galilean invariance). So Pinocchio evaluates the robot with its base at the origin and
+    # v_b = 0, and the motion of the base is added afterwards. Without this, digits would be lost at
+    # orbital positions and velocities.
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
@@ -223,7 +230,7 @@ class Sensing:
         # The model may place its free-flyer joint away from the world's origin.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
-        # (output, state) for each output that is a state.
+        # (index in y, index in the state) for each output that is a state.
         self.states: list[tuple[int, int]] = []
         self._kinds: list[tuple[slice, Derivatives, list[Carried]]] = []
         signals: list[tuple[str, str]] = []
@@ -237,8 +244,8 @@ class Sensing:
                 indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
-        # Outputs of frames come first, because other outputs overwrite the data that frame outputs
-        # read.
+        # Outputs of frames are evaluated first, because the other outputs overwrite the data that
+        # the outputs of frames read.
         self._kinds.sort(key=lambda kind: not kind[2])
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
@@ -251,13 +258,14 @@ class Sensing:
                 f"output {inertial[0]} needs inertial axes, but the world of '{robot.name}' "
                 "rotates with its orbit; remove this output"
             )
-        # If an output depends on acceleration, D is not zero.
+        # Whether an output depends on the acceleration. Otherwise, D is zero.
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
-        """Return the outputs and their derivatives at valid q (nq,) and v (nv,).
+        """Return the outputs and their derivatives at q (nq,) and v (nv,), which are not checked.
 
-        `data` is overwritten. The acceleration `a` is ignored unless `needs_acceleration`.
+        Outputs that are states are zero in the result. `data` is overwritten. The acceleration `a`
+        (nv,) is dv/dt, and is ignored unless `needs_acceleration` is true.
         """
         ny, nv = len(self.names), len(v)
         sensed = Sensed(np.zeros(ny), *np.zeros((3, ny, nv)))
@@ -293,9 +301,10 @@ class Sensing:
 
 
 class Measuring:
-    """Outputs y by kinematics without derivatives, to check C and D.
+    """Outputs y computed by kinematics without derivatives, to check C and D.
 
-    Rotations of frames are relative to their attitude at the configuration q.
+    The orientation output of a frame is the rotation vector from its attitude at the configuration
+    q to its current attitude.
     """
 
     def __init__(self, state: StateMap, q: Array) -> None:
@@ -303,7 +312,7 @@ class Measuring:
         self.model, self.data = robot.model, robot.create_data()
         self.reference, self.gravity = state.reference, np.array(robot.gravity)
         self.stored = robot.stored_momentum  # as in `Point`
-        # Angular velocity (3,) of the orbit frame in its own axes.
+        # Angular velocity (3,) of the orbital frame in its own axes; zero without an orbit.
         self.spin = np.zeros(3) if field is None else field.rate
         pin.forwardKinematics(self.model, self.data, q)
         frames = [[find_frame(self.model, x) for x in output.frames] for output in robot.outputs]
@@ -311,7 +320,10 @@ class Measuring:
         self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
 
     def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
-        """Return y (ny,); `a` (nv,) is dv/dt as Pinocchio's ABA returns it."""
+        """Return y (ny,) at the state x and the same point (q, v).
+
+        `a` (nv,) is dv/dt as Pinocchio's ABA returns it.
+        """
         pin.forwardKinematics(self.model, self.data, q, v, a)
         return np.concatenate(
             [
@@ -327,7 +339,7 @@ class Measuring:
         return self.data.oMi[frame.joint] * frame.placement
 
     def velocity(self, frame: Carried) -> pin.Motion:
-        """Return the twist of a frame in its own axes."""
+        """Return the twist of a frame, in the axes of this frame."""
         return frame.placement.actInv(self.data.v[frame.joint])
 
 

@@ -1,4 +1,4 @@
-"""Configurations, velocities and inputs, built from values by name."""
+"""Configurations, velocities and inputs, built from values that are given by name."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -55,9 +55,10 @@ def configuration(
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    values = numbers("joints", {} if joints is None else joints, "joint", "joint")
-    for name, value in by_joint(values, robot.joint_names, robot.joint).items():
-        robot.joint(name).place(q, value)
+    if joints is not None:
+        values = numbers("joints", joints, "joint", "joint")
+        for name, value in by_joint(values, robot.joint_names, robot.joint).items():
+            robot.joint(name).place(q, value)
     robot.follow(q)
     return robot.checked_configuration(q)
 
@@ -72,13 +73,19 @@ def require_slow(what: str, v: Array) -> None:
 
 
 def base_of(state: Mapping[str, Any]) -> pin.SE3:
-    """Return the base placement of a state mapping, such as a robot's point, start or target."""
+    """Return the base placement from "rpy" [deg] and "position" [m] of a mapping.
+
+    The mapping is a robot's `point`, `start` or `target`. A missing entry counts as zero.
+    """
     rotation = pin.rpy.rpyToMatrix(*np.radians(state.get("rpy", np.zeros(3))))
     return pin.SE3(rotation, np.array(state.get("position", np.zeros(3))))
 
 
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two state mappings; parts, joints and rates of `other` take precedence."""
+    """Merge two mappings as in `base_of`; entries of `other` replace entries of `state`.
+
+    In the parts "joints" and "velocity", single joints and rates are replaced.
+    """
     both = {**state, **other}
     for part in ("joints", "velocity"):
         if part in both:
@@ -87,10 +94,11 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:
-    """Return the initial configuration (nq,) and velocity (nv,) of a robot."""
+    """Return the initial configuration (nq,) and velocity (nv,): `start`, completed by `point`."""
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
-    return q, velocity(robot, start.get("velocity", {}))
+    rates = start.get("velocity")
+    return q, velocity(robot, rates) if rates else np.zeros(robot.nv)
 
 
 def point_of(
@@ -100,7 +108,7 @@ def point_of(
     v0: ArrayLike | None,
     default: Callable[[], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
-    """Return q (nq,) and v (nv,) from x0, from q0 and v0, or by default from `default`."""
+    """Return q (nq,) and v (nv,) from x0, or from q0 and v0, or from `default` if all are None."""
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:

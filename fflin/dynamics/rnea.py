@@ -1,4 +1,4 @@
-"""Inertia M and M^-1, accelerations, and their derivatives by RNEA."""
+"""Inverse inertia M^-1, accelerations, and derivatives of the accelerations by RNEA."""
 
 import warnings
 from operator import attrgetter
@@ -16,69 +16,78 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import coordinate_names
 
-# The coupling of a coordinate i is M_ii (M^-1)_ii. It is 1 for a decoupled coordinate. If all other
-# coordinates are free, i has the inertia 1 / (M^-1)_ii. The smaller this inertia is relative to
-# M_ii, the larger is the coupling. Coupling times machine epsilon is the relative error of
-# (M^-1)_ii. If the sum of all couplings exceeds WARNING_COUPLING, M^-1 has fewer than nine correct
-# digits; above _LARGEST_COUPLING fewer than two. Exact couplings are at least 1, so a sum below the
-# number of coordinates shows that some pivots are only rounding errors.
+# The coupling of a coordinate i is M_ii (M^-1)_ii. Coordinate i has the inertia M_ii if all other
+# coordinates are locked, and the inertia 1 / (M^-1)_ii if they are free. The coupling is the ratio
+# of these two inertias, and is 1 for a decoupled coordinate. The relative error of (M^-1)_ii is
+# about the coupling times machine epsilon. If the sum of all couplings exceeds WARNING_COUPLING,
+# M^-1 has fewer than nine correct digits. If the sum exceeds _LARGEST_COUPLING, M^-1 has fewer than
+# two. Exact couplings are at least 1. So if the computed sum is less than the number of
+# coordinates, some pivots of M are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
-# Pinocchio's articulated-body inverse sums inertias about the base's origin. With `inertia_bounds`
-# in place of M_ii, the couplings bound the rounding errors of this inverse. If their sum exceeds
-# this limit, a Cholesky factor of M is used instead.
+# Pinocchio's articulated-body inverse sums inertias about the base's origin. If `inertia_bounds`
+# replace M_ii, the couplings also bound the rounding errors of this inverse. If the sum of these
+# couplings exceeds the following limit, M^-1 is computed by a Cholesky factor of M instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
 STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
 
-# If M has more rows than this, LAPACK is faster than a sparse factor.
+# If M has more rows than this, LAPACK factorises it faster than Pinocchio's sparse method.
 _DENSE_SIZE = 64
 
 
-# Looked up once, because looking up a name in a module takes as long as factorising a small
-# matrix.
+# These functions are looked up once, because looking up a name in a module takes as long as
+# factorising a small matrix.
 _crba, _compute_inverse, _cholesky = pin.crba, pin.computeMinverse, pin.cholesky
 
 
 class Inertia:
-    """M^-1 at a configuration, in base axes and state order."""
+    """Computation of M^-1 at configurations of one robot, in base axes and state order."""
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
         self._state, self._model, self._data = state, robot.model, data
-        # Views of an array that Pinocchio overwrites in place.
+        # These are views of the array `data.Minv`, which Pinocchio overwrites in place.
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
-        # If v is not a permutation of nu (mimic joints, modes), M is factorised as a dense matrix.
+        # With mimic joints or modes, v is not a permutation of nu. M is then factorised as a dense
+        # matrix.
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
         self._slides = [*map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))]
-        # M does not depend on the base's pose. The base is placed at the origin because Pinocchio
-        # works in world axes, and would lose digits if the base were far away.
+        # M does not depend on the base's pose. Pinocchio works in world axes, and would lose digits
+        # if the base were far away. So the base is placed at the origin.
         self._still = pin.neutral(robot.model)
         self.least_coupling = 0.999 * (6 + robot.n)
 
     def centred(self, q: Array) -> Array:
-        """Return q with the base at the origin, in an array that the next call overwrites."""
+        """Return q with the base in its neutral pose at the origin.
+
+        The next call overwrites the returned array.
+        """
         if q is not self._still:
             self._still[7:] = q[7:]
         return self._still
 
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
-        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
+        """Write M^-1 (6 + n, 6 + n) at a configuration into the C-contiguous array `out`.
+
+        The configuration is not checked. If `quick` is true, the articulated-body inverse is used
+        where it is accurate.
+        """
         still = self.centred(q)
-        # The articulated-body inverse is used only if `quick`. Its rounding errors would appear in
-        # entries of M^-1 K that should be exactly zero. The relative rounding errors of a Cholesky
-        # factor do not depend on the scaling of M.
+        # The rounding errors of the articulated-body inverse would appear in entries of M^-1 K that
+        # should be exactly zero, where K is the stiffness. The relative rounding errors of a
+        # Cholesky factor are smaller, because they do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
         ):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
-            # A zero pivot gives NaN, which makes this comparison false.
+            # If a pivot is zero, the couplings are NaN, and this comparison is false.
             if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
         upper = _crba(self._model, self._data, still)
@@ -91,12 +100,15 @@ class Inertia:
             inverse = _cholesky.computeMinv(self._model, self._data)
             self._state.project(inverse, out)
             coupling = upper.diagonal().dot(inverse.diagonal())
-        # A zero pivot gives NaN, which this condition also reports.
+        # If a pivot is zero, the coupling is NaN. The negated comparison is then true.
         if not self.least_coupling < coupling < WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T))
 
     def _judge(self, coupling: float, M: Array) -> None:
-        """Raise an error for a singular M, or warn of an ill-conditioned M, naming coordinates."""
+        """Raise an error for a singular M, or give a warning for an ill-conditioned M.
+
+        The message names the coordinates whose motion has almost no inertia.
+        """
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # true for NaN as well
@@ -128,13 +140,14 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Return upper bounds of the mass or moment of inertia that each coordinate moves.
+    """Return upper bounds (nv,) of the masses and moments of inertia that the coordinates move.
 
-    Return None if a joint is neither revolute nor prismatic.
+    The moments of inertia are about the base's origin. Return None if a joint is neither revolute
+    nor prismatic.
     """
-    # The moment of inertia of a body about the base's origin has an upper bound. It is the body's
-    # largest principal moment, plus its mass times the squared length of the path to it. The path
-    # runs from joint to joint, and includes a displacement of `STROKE` at each prismatic joint.
+    # About the base's origin, the moment of inertia of a body is at most its largest principal
+    # moment plus its mass times the squared length of a path. The path leads from joint to joint to
+    # the body's centre of mass, and includes a displacement of `STROKE` at each prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
     if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
@@ -146,7 +159,8 @@ def inertia_bounds(model: pin.Model) -> Array | None:
             step += STROKE if kinds[index] == "JointModelP" else 0.0
             distances[index] = distances[parents[index]] + step
         masses[index] = item.mass
-        # The largest row sum of an inertia matrix is a bound of its largest principal moment.
+        # The largest principal moment is at most the largest row sum of the absolute values of the
+        # inertia matrix.
         turning = float(np.abs(item.inertia).sum(axis=0).max())
         arm = distances[index] + float(np.linalg.norm(item.lever))
         moments[index] = item.mass * arm**2 + turning
@@ -161,19 +175,19 @@ def inertia_bounds(model: pin.Model) -> Array | None:
 
 
 class AccelerationDerivatives(NamedTuple):
-    """Accelerations of the base origin and the joints, in base axes, and their derivatives.
+    """Accelerations c of the base and the joints (3.1), and their derivatives, in base axes.
 
-    The arrays have leading axes if there are several points.
+    The arrays have leading axes (..) if there are several points.
     """
 
-    c: Array  # (.., 6 + n) of (3.1): without gravity and omega x v_b
+    c: Array  # (.., 6 + n): without gravity and omega_b x v_b, see (3.2)
     slopes: Array  # (.., 6 + n, 12 + 2 n) over displacements of the state in base axes
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
     gravity: Array  # (.., 3) in base axes
 
     @property
     def by_turn(self) -> Array:
-        """Derivatives (.., 6 + n, 3) over a rotation of the base: zero except in orbit (14.5)."""
+        """D_theta (.., 6 + n, 3) of (14.5), for rotations of the base; zero without an orbit."""
         return self.slopes[..., :3]
 
     @property
@@ -183,12 +197,15 @@ class AccelerationDerivatives(NamedTuple):
 
     @property
     def by_nu(self) -> Array:
-        """D_nu (.., 6 + n, 6 + n) of (3.3), zero over the base's linear velocity."""
+        """D_nu (.., 6 + n, 6 + n) of (3.3); its columns for v_b are zero."""
         return self.slopes[..., self.c.shape[-1] :]
 
 
 class Accelerations:
-    """Solution of ``M nudot + b = B u`` of a robot, with its derivatives, in base axes."""
+    """Solution c of the equations of motion ``M c + b = B_u u`` (3.1), with its derivatives.
+
+    Springs and dampers add their forces to the right side.
+    """
 
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
         robot = state.robot
@@ -197,14 +214,15 @@ class Accelerations:
         self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # Derivatives of M a + b - B u - springs over the displacements of the state. They are
-        # stored transposed, so that their parts are contiguous. The first six rows, for attitude
-        # and position of the base, are zero without an orbit.
+        # `rows` contains the derivatives at constant c of M c + b - B_u u minus the forces of
+        # springs and dampers. They are stored transposed, with one row for each coordinate of a
+        # displacement of the state, so that their parts are contiguous. The first six rows are for
+        # the attitude and position of the base. They are zero without an orbit.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
         self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
         self._by_linear = self._by_nu[LINEAR]
-        # Views of the diagonals to which stiffness and damping are added.
+        # These are views of the diagonals to which stiffness and damping are added.
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
@@ -215,17 +233,17 @@ class Accelerations:
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:
-        """Return the accelerations and their derivatives at q, v and u in base axes.
+        """Return the accelerations c and their derivatives at q, v and u in base axes.
 
-        `nu` is v in state order. The derivatives are written into the C-contiguous arrays `slopes`
-        and `by_u`.
+        `nu` is v in state order. The C-contiguous arrays `slopes` and `by_u` receive the
+        derivatives, and the result refers to these arrays.
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # The base's placement and linear velocity are left out, because c does not depend on them
-        # in base axes. Large values would also make Pinocchio's derivatives less accurate. Gravity
-        # is left out as well, because it accelerates all parts of the robot alike (equivalence
-        # principle).
+        # The pose of the base is neutral and its linear velocity zero here, because c does not
+        # depend on them. Large values would also make Pinocchio's derivatives less accurate.
+        # Gravity is zero as well, because uniform gravity accelerates all parts of the robot alike
+        # (equivalence principle).
         q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
@@ -248,8 +266,9 @@ class Accelerations:
             force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
 
-        # Derivatives of M a + b - B u - springs (3.3), (7.1). The wrenches are constant in the
-        # frames of their links, so RNEA's derivatives include -d(B u)/dq.
+        # Derivatives of M c + b - B_u u minus the forces of springs and dampers (3.3), (7.1). The
+        # wrenches of inputs are constant in the frames of their links. So the derivatives of RNEA
+        # with these wrenches include -d(B_u u)/dq.
         external = () if wrenches is None else (wrenches,)
         by_q, by_v, _ = pin.computeRNEADerivatives(
             model, data, q_still, v_still, state.spread(c), *external
@@ -275,16 +294,20 @@ class Accelerations:
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None
     ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
-        r"""Return the gyroscopic torques :math:`-\omega \times h` of stored momentum.
+        r"""Return the gyroscopic torques :math:`h \times \omega` of wheels without inertia (6.3).
 
-        Return four results: the wrenches on all joints, with the gyroscopic torques added; the
-        torques as a generalised force (nv,); and its derivatives (nv, nv) over q and over v. The
-        derivative over q excludes the change of the Jacobian, because RNEA's derivatives with these
-        wrenches already include it.
+        The four results are
+
+        - the wrenches on all joints, to which the gyroscopic torques are added;
+        - the generalised force (nv,) of the gyroscopic torques;
+        - the derivatives (nv, nv) of this force over q and over v.
+
+        The derivatives over q exclude the change of the Jacobian, because the derivatives of RNEA
+        with these wrenches already include it.
         """
         model, data, nv = self._model, self._data, len(v)
-        # Let J be the angular Jacobian of a link, in the axes of the link. The torque h x omega
-        # then gives the generalised force J^T [h]x J v (6.3).
+        # With the angular Jacobian J of a link in the axes of the link, the torque h x omega has
+        # the generalised force J^T [h]x J v (6.3).
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))

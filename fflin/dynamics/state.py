@@ -98,24 +98,27 @@ class StateMap:
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
-        # Acceleration field of the robot's orbit; None without an orbit.
+        # Acceleration field of the orbit, or None if the robot is not in orbit.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
         ends = 3, 6, 6 + n, 9 + n, 12 + n, self.nx
         self.groups = names.Groups(*map(slice, (0, *ends), ends))
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
-        # Index in Pinocchio's v of each velocity of the state.
+        # For each velocity of the state, its index in Pinocchio's v.
         self._order = np.array([3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp)
-        # The inverse map. `spread` writes the entries of mimic joints afterwards.
+        # For each entry of Pinocchio's v, the index of the velocity of the state. Mimic joints have
+        # no such velocity; `spread` overwrites their entries.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
         self._flat_transposed = np.ascontiguousarray(self._flat.T)
-        # Pinocchio's v per unit of each velocity of the state: 1 except for modal amplitudes.
+        # Factor from each velocity of the state to Pinocchio's v. It is 1 except for the velocities
+        # of modal amplitudes.
         self._scale = np.array([1.0] * 6 + [*map(attrgetter("scale"), joints)])
         self._scaled = bool((self._scale != 1.0).any())
-        # S of v = S nu; None if S is the permutation `_order` (no mimic joints and no scaling).
+        # Matrix S of v = S nu. It is None without mimic joints and modes, because S is then only
+        # the permutation `_order`.
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
@@ -125,7 +128,8 @@ class StateMap:
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
-        # Whether gravity or an orbit accelerates the base's origin relative to the reference.
+        # Whether gravity or the motion in orbit accelerates the base's origin relative to the
+        # reference.
         self.falls = self._pulled or robot.orbit is not None
         self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
 
@@ -137,8 +141,8 @@ class StateMap:
 
     def _refer(self, oMref: pin.SE3) -> None:
         self._reference = oMref
-        # The model may place its free-flyer joint away from the world's origin. Rotations are
-        # composed as quaternions, which stay accurate to machine precision near 180 deg.
+        # The free-flyer joint of the model may have a placement other than the identity. Rotations
+        # are composed as quaternions, which are accurate to machine precision even near 180 deg.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
@@ -241,7 +245,7 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
-        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = chart.to_reference(self.in_reference, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:
@@ -290,7 +294,8 @@ class StateMap:
         q[:, self._sin] = np.sin(angles[:, self.unbounded])
         for row in q if self.robot.followers else ():
             self.robot.follow(row)
-        return chart, q, self.spread(self.to_base(chart, x[:, 6 + self.robot.n :, None])[..., 0])
+        nu = chart.to_base(self.in_reference, x[:, 6 + self.robot.n :, None])[..., 0]
+        return chart, q, self.spread(nu)
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes from Pinocchio's v (.., nv)."""
@@ -325,7 +330,8 @@ class StateMap:
         """
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
-        # With mode="clip", NumPy writes into `out` without a buffer. No index is out of range.
+        # With mode="clip", NumPy writes directly into `out`, without a buffer. This mode clips no
+        # index here, because all indices are in range.
         return matrix.take(self._flat, out=out, mode="clip")
 
     def project_transposed(self, matrix: Array, out: Array) -> None:
@@ -373,20 +379,21 @@ class StateMap:
 
 
 class Actuation:
-    """Inputs of a robot, with their names, units, columns and wrenches."""
+    """Inputs of a robot: their names and units, the matrix B_u, and their wrenches on the links."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self.state, self._model = state, robot.model
         names: list[str] = []
         units: list[str] = []
-        # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel, in
-        # the order in which they first appear.
+        # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel. They
+        # are in the order of their first inputs.
         self.groups: dict[str, list[int]] = {}
         columns: list[Array] = []
         held: list[slice] = []
-        # Thrusters and wheels without a joint of their own. {joint on which they are mounted:
-        # (index of the input, wrench (6,) of a unit input in the joint's frame)}.
+        # Thrusters, and wheels that are modelled without a joint of their own, by the joint on
+        # which they are mounted. Each item is (index of the input, wrench (6,) of a unit input in
+        # the frame of this joint).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in robot.named_inputs:
@@ -414,17 +421,20 @@ class Actuation:
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two inputs are named '{twice}'; give one of them another name")
-        # In linear models, the same attributes have the names `input_names` and `input_units`.
+        # Linear models have the attributes `input_names` and `input_units`. They are defined here
+        # too, so that some functions accept either object.
         self.names = self.input_names = tuple(names)
         self.units = self.input_units = tuple(units)
-        # Slices of three inputs that form a torque or force on the base in reference axes.
+        # One slice of three inputs for each torque or force on the base that is in reference axes.
         self.held = tuple(held)
-        # Generalised force (6 + n, nu) per unit of each input. It is zero for an input whose
-        # generalised force depends on the configuration.
+        # B_u (6 + n, nu) with zero columns for the inputs whose generalised forces depend on the
+        # configuration.
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
-        # Whether the inputs are tau_b, F_b and all joint torques, so that `fixed` is the identity.
+        # Whether the inputs are tau_b, F_b and all joint torques in state order, so that B_u is the
+        # identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
-        # (joint, indices of the inputs mounted on it, their wrenches (6, ..) in its frame).
+        # One item for each joint with such inputs: (joint, indices of the k inputs that are mounted
+        # on it, wrenches (6, k) of unit inputs in the frame of the joint).
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
         self._of_carried: list[int] = []
         for joint, items in carried.items():
@@ -434,7 +444,7 @@ class Actuation:
         self.carried = bool(carried)  # whether columns depend on the configuration
 
     def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return B_u (6 + n, nu), the generalised force in base axes per unit input (6.1)."""
+        """Return B_u (6 + n, nu) at q, the generalised forces of unit inputs in base axes (6.1)."""
         if not self.carried:
             return self.fixed
         columns = self.fixed.copy()
@@ -447,13 +457,17 @@ class Actuation:
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
-        """Rotate the reference-frame wrenches in u (.., nu) to base axes."""
+        """Return the inputs u (.., nu) with all torques and forces on the base in base axes."""
         if not self.held:
             return u
         return chart.to_base(self.held, u[..., None])[..., 0]
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of thrusters and wheels on each joint, in its frame, or None."""
+        """Return, for each joint, the wrench of the thrusters and wheels that are mounted on it.
+
+        Each wrench is in the frame of its joint. The result is None if no input is mounted on a
+        joint in this way.
+        """
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
@@ -463,5 +477,5 @@ class Actuation:
 
 
 def selection(names: Sequence[str], of: Sequence[str]) -> Array:
-    """Return the matrix S (k, n) that selects some of n names."""
+    """Return the matrix S (k, n) that selects the entries `names` of a vector with names `of`."""
     return np.eye(len(of))[[*map(of.index, names)]]

@@ -35,8 +35,8 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Largest rounding error that the test program accepts in double precision, relative to the
-# magnitudes of the terms.
+# Largest relative rounding error that the test program accepts in double precision. The error of
+# each result is relative to `Case.scale`, the sum of the magnitudes of its terms.
 _DOUBLE_ERROR = 1e-14
 
 _INVALID = 2  # status of a step with invalid arguments
@@ -137,7 +137,7 @@ def write_c(
 
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
-    """Return a digest of a law's description and code, to detect a change in any of them."""
+    """Return the SHA-256 of a law's description, header and source, to detect any change."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
 
@@ -251,7 +251,7 @@ class CLaw:
             there, sizes = (Measuring(state, q), state.read(q, v)), (self._about["memory"], 0)
             return Loop(state, self.dt, sizes, lambda t: (partial(self._output_step, t), *there))
         world, n = StateMap(robot, frame=state.frame), robot.n
-        # C has no empty arrays, so an array for joints has at least one entry.
+        # C has no empty arrays. So the C arrays for the joints have one entry if there is no joint.
         room = max(n, 1)
         given, u = (np.zeros(size, self._real) for size in (13 + 2 * room, len(self._about["u0"])))
         at = [*range(7 + n), *range(7 + room, 13 + n + room)]
@@ -266,10 +266,11 @@ class CLaw:
         return policy
 
     def _output_step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
-        """Return the command of a sample, and the next state of the controller.
+        """Return the command u of a sample, and the next controller state.
 
-        The code is called twice, because accelerometer outputs depend on the command. The first
-        call computes the command under which the second call's outputs are measured.
+        z is the controller state, and `measure(u)` returns the outputs under the inputs u. The C
+        code is called twice, because accelerometers measure the effect of the command. The outputs
+        for the second call are measured under the command from the first call.
         """
         u = np.array(self._about["u0"])
         for _ in range(2):
@@ -289,7 +290,7 @@ class CLaw:
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
-    """Compile a source file, and return its shared library."""
+    """Compile a C source file to a shared library, and return the loaded library."""
     if not isinstance(compiler, str) or "\0" in compiler:
         raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
     found = shutil.which(compiler)
@@ -312,12 +313,13 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
 
 
 def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
-    """Return the title of a law, and the text of each of its files by file ending."""
+    """Return the title of a law, and the texts of its four files as {file ending: text}."""
     state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
     names, units = law.inputs
     kind, title = "state" if state else "output", f"{law.title} of '{robot.name}'"
     frame = state.frame if state else lin.frame if lin else ""
-    # For single precision, the accepted error is the unit roundoff times the number of operations.
+    # In single precision, the accepted relative error is the unit roundoff 2^-24 times the number
+    # of operations.
     error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
     bounds = error * np.max([case.scale for case in law.cases], axis=0)
     sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
@@ -373,7 +375,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
-    """Return {placeholder: text} for the placeholders that only laws of states have."""
+    """Return {placeholder: text} for the placeholders that only templates of state laws have."""
     n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
     words: dict[str, object] = {
         **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
@@ -407,7 +409,7 @@ def _filled(template: str, words: dict[str, object]) -> str:
 
 def _array(values: Array, real: str) -> str:
     """Return the C initialiser of an array."""
-    # C has no empty arrays: an array without rows or columns gets a row or column of zeros.
+    # C has no empty arrays. So an array without rows or columns gets a row or a column of zeros.
     values = np.pad(values, [(0, int(not size)) for size in values.shape])
     if values.ndim > 1:
         return "{\n" + ",\n".join(_array(row, real) for row in values) + "}"
@@ -427,12 +429,12 @@ def _array(values: Array, real: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Replace the characters of a text that may be invalid in a C comment or a C string."""
+    """Replace by "_" each character that may be invalid in a C comment or a C string."""
     return re.sub(r"[^\w .,+^()\[\]/-]", "_", text, flags=re.ASCII)
 
 
 def _listed(array: str, names: Sequence[str], units: Sequence[str]) -> str:
-    """Return the lines of a C comment that give the name and unit of each entry of an array."""
+    """Return lines of a C comment, one for each entry of an array, with its name and unit."""
     return "\n".join(
         f" *   {array}[{k}]  {_plain(name)} [{_plain(unit) or '-'}]"
         for k, (name, unit) in enumerate(zip(names, units, strict=True))

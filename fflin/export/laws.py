@@ -1,4 +1,4 @@
-"""Conversion of control laws to the tables of their C code, with test cases from fflin."""
+"""Conversion of control laws to the tables of their C code, and test cases for this code."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -32,10 +32,11 @@ OfOutputs: TypeAlias = LinearController | Compensator
 
 
 class Case(NamedTuple):
-    """Test case with the arguments `given` of a step, and its results `out`.
+    """Test case for the C code: arguments `given` of a step, and the correct results `out`.
 
-    The rounding error of `out` is at most the product of the unit roundoff, `scale` and the number
-    of operations.
+    `sample` is the number of the sample, and `scale` is the sum of the magnitudes of the terms of
+    each result. The rounding error of a result is at most the product of the unit roundoff, its
+    `scale` and the number of operations.
     """
 
     sample: int
@@ -46,11 +47,12 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """Tables of the C code of a control law, and test cases.
+    """Control law, converted to the tables of its C code, with test cases.
 
-    A state law is ``u = u0 - K (x - x0)``. Its tables have one row, or one row for each sample. If
-    there is a table `axis_points`, K is interpolated on a grid of joint positions. An output law is
-    ``u = u0 + C z + D (y - y0)``; the next z is ``A z + B (y - y0)``.
+    A state law is ``u = u0 - K (x - x0)``. Its tables have one row for all samples, or one row for
+    each sample. If there is a table `axis_points`, K is interpolated between joint positions, and
+    the table contains the positions of the grid. An output law is ``u = u0 + C z + D (y - y0)``.
+    The next controller state z is ``A z + B (y - y0)``.
     """
 
     title: str
@@ -66,9 +68,9 @@ class Law:
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
-    """Return the arguments (13 + 2n,) of the C code of a state law, for valid q and v.
+    """Return the arguments (13 + 2n,) of the C code of a state law at q and v.
 
-    `world` is the robot's state map relative to the world.
+    `world` is a state map of the robot whose reference is the world. q and v are not checked.
     """
     attitude, nu = quaternion_product(world.origin_quaternion, q[3:7]), world.velocities(v)
     pose = attitude, world.positions(q), world.joint_positions(q)
@@ -76,7 +78,7 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
 
 def law_of(given: object, robot: object, limits: object) -> Law:
-    """Convert a policy or design to the tables of a law, with `limits` as in `simulate`."""
+    """Convert a policy or a controller design to a `Law`, with `limits` as in `simulate`."""
     if isinstance(given, TrajectoryOutputFeedback) or not isinstance(given, OfStates | OfOutputs):
         raise InputError(
             f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
@@ -103,7 +105,7 @@ def law_of(given: object, robot: object, limits: object) -> Law:
                 "limits need the robot with the inputs of the law; give the robot of the design "
                 "with robot= (--robot)"
             )
-        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
+        low, high = input_limits(robot, chosen_limits(robot, limits))
     law.tables.update(low=low, high=high)
     return law
 
@@ -154,13 +156,17 @@ def _state_law(given: OfStates, robot: Robot) -> Law:
 def _state_cases(
     state: StateMap, policy: Policy, dt: float, tables: dict[str, Array], axes: dict[str, Array]
 ) -> Iterator[Case]:
-    """Yield test cases at random and near-singular states; the policy computes the results."""
+    """Yield test cases at random states, with the results that the policy computes.
+
+    Some states are close to half a turn from the reference or the target, or at the ends of the
+    grid.
+    """
     random, n, turning = np.random.default_rng(0), state.robot.n, state.unbounded
     world = StateMap(state.robot, frame=state.frame)
     for index in range(CASES):
         row = index % len(tables["x0"])
         x0, u0, about = (tables[key][row] for key in ("x0", "u0", "reference"))
-        # The state is random near x0. The base is at the reference; a random pose is set below.
+        # Joint positions and velocities are random near x0. The pose of the base is set below.
         x = x0 + random.normal(scale=10.0 ** random.uniform(-4, 0), size=state.nx)
         x[:6] = 0.0
         turns = np.zeros(n)
@@ -185,7 +191,7 @@ def _state_cases(
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
-        # Sum of the magnitudes of the terms from which each entry of x - x0 is computed.
+        # The next lines sum the magnitudes of the terms in each entry of x - x0.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
         rates = np.repeat((norm(omega), norm(v)), 3)
@@ -196,7 +202,10 @@ def _state_cases(
 
 
 def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise a robot at the operating point and reference of a gain from a file."""
+    """Linearise a robot at the operating point and reference of a gain that was read from a file.
+
+    Raise `InputError` if the gain was designed for a robot with another URDF.
+    """
     if gain.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
             f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
@@ -208,7 +217,10 @@ def _model_of(gain: Gain, robot: Robot) -> LinearModel:
 
 
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
-    """Return tables with one row for each sample; the last row applies after the trajectory."""
+    """Return the tables of a law with one row for each sample of a trajectory.
+
+    The last row also applies to all samples after the end of the trajectory.
+    """
     if not (dt := policy.schedule.dt):
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
@@ -261,7 +273,10 @@ def _output_law(given: OfOutputs, robot: Robot) -> Law:
 
 
 def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
-    """Yield test cases at random controller states and outputs; the results are u and next z."""
+    """Yield test cases at random controller states z and outputs y of the robot.
+
+    The results of a case are u and the next z.
+    """
     random, (nz, ny) = np.random.default_rng(0), by.B.shape
     for _ in range(CASES):
         size = 10.0 ** random.uniform(-4, 0)

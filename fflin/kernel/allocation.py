@@ -1,8 +1,9 @@
-"""Control allocation: distribute the commands of one set of inputs to another set with limits.
+"""Control allocation: convert the commands of one set of inputs to another set with limits.
 
-An active set method, which starts at zero thrust, solves the bounded least squares problem. The
-problem is strictly convex, so the solution does not depend on the order in which inputs reach
-their bounds.
+The allocated inputs minimise the error of the accelerations within the limits. An active set method
+solves this bounded least squares problem. It starts with all inputs at zero, or at the nearest
+bound. The problem is strictly convex, so the solution does not depend on the order in which inputs
+reach their bounds.
 
 References
 ----------
@@ -20,8 +21,8 @@ from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import called, load, root, store
 
-# Weight of the inputs' magnitudes in the cost. Among solutions with the same effect, it selects the
-# solution with the smallest inputs.
+# The cost contains the squares of the inputs, multiplied by LEAST^2. Among inputs with the same
+# effect, this term selects the smallest inputs.
 LEAST = 1e-7
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -29,27 +30,30 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns A Q R b y wanted x s low high state order")
 ):
-    """Problem: find x (k,) with least <= x <= most for which columns @ x is nearest to a force.
+    """Problem: find inputs x (k,) within bounds whose force is nearest to a given force (size,).
 
-    `columns` holds the k columns of generalised force per unit input, one after the other, and then
-    the force. The other fields are work space:
+    - `least`, `most` (k,): the bounds of x.
+    - `columns`: k + 1 vectors (size,), one after the other. The first k are the forces of unit
+      inputs. The last is the given force.
 
-    - `A`: the columns of one lane, divided by the norm of the matrix that they form, and then the
-      force of this lane.
-    - `Q`, `R`: QR factors of the free inputs' columns, extended by rows that contain `LEAST`.
-      `order`: the free inputs, in the order in which they became free.
-    - `b`: the residual. `y`: its components along `Q`.
-    - `wanted`: the force, scaled to length 1.
-    - `s`: the solution without bounds. `low`, `high`: the scaled bounds.
+    The other fields are work space:
+
+    - `A`: the vectors of `columns` for one lane. The first k are divided by their common norm.
+    - `Q`, `R`: QR factors of a matrix with one column for each free input. A column contains the
+      force of this input from `A`, and then k entries: `LEAST` for this input and zeros.
+    - `order`: the free inputs, in the order in which they became free.
+    - `b`: the residual. `y`: the components of the residual along the vectors of `Q`.
+    - `wanted`: the given force, scaled to length 1.
+    - `s`: the least squares solution without bounds. `low`, `high`: the bounds of the scaled x.
     - `state`: for each input, whether it is free, at its lower bound or at its upper bound.
     """
 
 
 class Allocation(namedtuple("Allocation", "asking giving point work problem")):
-    """Allocation of commands for one robot's inputs (`asking`) to another robot's (`giving`).
+    """Allocation of commands for the inputs of the robot `asking` to the robot `giving`.
 
-    `point` holds q and the inputs of one of the two robots at a time. `work` is work space.
-    Commands are not allocated if `problem` has no inputs.
+    Both are the same robot with different inputs. `point` holds q, and the inputs first of `asking`
+    and then of `giving`. `work` is work space. If `problem` has no inputs, nothing is allocated.
     """
 
 
@@ -67,7 +71,7 @@ def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> flo
 
 @vec.compiled_as(_row_product)
 def row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
-    """Return the scalar product of `count` entries of two arrays of numbers."""
+    """Return the scalar product of two vectors (count,): a from `first` on, and b from `second`."""
     return a[first : first + count].dot(b[second : second + count])
 
 
@@ -78,7 +82,7 @@ def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: i
 
 @vec.compiled_as(_add_row)
 def add_row(a: Array, first: int, factor: float, b: Array, second: int, count: int) -> None:
-    """Add `factor` times `count` entries of b, from `second` on, to entries of a."""
+    """Add `factor` times `count` entries of b from `second` on to the entries of a from `first`."""
     a[first : first + count] += factor * b[second : second + count]
 
 
@@ -89,13 +93,13 @@ def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 @vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    """Write the scalar product of each row (size,) of a with the first `size` entries of b."""
+    """Write to `out` the scalar products of the rows (size,) of a with the first entries of b."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
 def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    # Modified Gram-Schmidt. The right-hand side is treated as the last column of the matrix. The
-    # least squares solution is then as accurate as with Householder's method.
+    # This is the modified Gram-Schmidt method. The least squares solution is as accurate as with
+    # Householder's method, because the right-hand side is treated as the last column of the matrix.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)
@@ -104,7 +108,10 @@ def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, 
 
 @vec.compiled_as(_remove_components)
 def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    """Make x orthogonal to the first `count` rows of Q, and write its components along them."""
+    """Make x (size,) orthogonal to the first `count` rows of Q, which have unit length.
+
+    The components of x along these rows are written to `found`, from the index `first` on.
+    """
     basis = Q[: count * size].reshape(count, size)
     components = basis.dot(x)
     x -= components.dot(basis)
@@ -122,12 +129,12 @@ def _write_scaled(source: Array, lane: int, share: float, target: Array) -> None
 
 @vec.compiled_as(_write_scaled)
 def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None:
-    """Write `factor` times the first entries of one lane of `source` into `target`."""
+    """Write `factor` times one lane of `source` to `target`, as many entries as `target` has."""
     target[:] = factor * source[: len(target)]
 
 
 def least_squares(least, most, size):
-    """Return a problem with bounds (k,) and forces (size,), for a single lane."""
+    """Return a `LeastSquares` problem with the bounds (k,) for forces (size,), for one lane."""
     count = len(least)
     lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
     lengths |= dict.fromkeys(("columns", "A"), (count + 1) * size)
@@ -144,9 +151,11 @@ def least_squares(least, most, size):
 
 @called
 def allocate(allocation, point, commanded):
-    """Write the inputs whose accelerations are nearest to the accelerations of a command.
+    """Write to `point.u` the inputs of `giving` that replace a command for the inputs of `asking`.
 
-    If there is no allocation problem, the command is written unchanged.
+    Within their bounds, these inputs minimise e^T M e, where e is the difference between their
+    accelerations and the accelerations of the command. If the problem has no inputs, the command is
+    written unchanged.
     """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
@@ -160,7 +169,7 @@ def allocate(allocation, point, commanded):
     write_columns(work, tree)
     vec.copy(commanded, 0, own.pushing, 0, len(commanded))
     _write_force(work, asking, own, columns, count * size)
-    # Write the generalised force per unit of each input, one input after the other.
+    # Write the generalised forces of unit inputs, one after the other.
     write_columns(work, giving.tree)
     for unit in range(count):
         for index in range(count):
@@ -179,7 +188,10 @@ def allocate(allocation, point, commanded):
 
 
 def _write_force(work, robot, point, columns, at):
-    """Write the generalised force of the inputs `pushing` of a point."""
+    """Write the generalised force of the inputs `point.pushing` to `columns` from `at` on.
+
+    The inputs are converted to base axes in place.
+    """
     turn_held(robot, point)
     push(work, robot.tree, point.pushing)
     vec.copy(work, robot.tree.c, columns, at, len(robot.tree.row))
@@ -187,7 +199,7 @@ def _write_force(work, robot, point, columns, at):
 
 @called
 def solve(problem, size, lane):
-    """Write the solution of one lane into x; x is NaN if the force is NaN."""
+    """Write the solution of a problem for one lane to its x; x is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count = problem.least, problem.most, len(problem.least)
     write_scaled(problem.columns, lane, 1.0, A)
@@ -209,8 +221,8 @@ def solve(problem, size, lane):
         write_scaled(A[last:], 0, 1.0 / force, wanted)
         write_scaled(A, 0, 1.0 / unit, A)
         free, kept = _solve_scaled(problem, size, free, 0)
-        # Remove the part of the force that the inputs cannot produce, because its rounding error
-        # would exceed the rows of LEAST.
+        # Keep only the part of the force that the inputs produce. The rounding errors of the other
+        # part would be larger than the terms with LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
@@ -222,10 +234,10 @@ def solve(problem, size, lane):
 
 @called
 def _solve_scaled(problem, size, free, kept):
-    """Solve for the force `wanted`, starting from x and the `state` of the inputs.
+    """Write the solution for the force `wanted` to x, starting from x and `state`.
 
-    The first `free` inputs in `order` are free. The factor contains the columns of the first
-    `kept` of them. Return `free` and `kept` for the next call.
+    `free` is the number of free inputs in `order`. The QR factors contain the columns of the first
+    `kept` of these inputs. Return `free` and `kept` for the next call.
     """
     x, s, low, high = problem.x, problem.s, problem.low, problem.high
     state, order, count, newest = problem.state, problem.order, len(problem.x), -1
@@ -251,7 +263,8 @@ def _solve_scaled(problem, size, free, kept):
             if j != newest or step > 0.0:
                 newest = -1
                 continue
-            # Rounding errors moved the released input beyond its bound: try another input.
+            # The input that was just released is beyond its bound again, because of rounding
+            # errors. So another input is released instead.
             state[j] += _TRIED
             _fit(problem, size, free, kept)
             kept = free
@@ -271,21 +284,22 @@ def _solve_scaled(problem, size, free, kept):
 
 @called
 def _fit(problem, size, free, kept):
-    """Write the least squares solution for the free inputs into s, and the residual into b.
+    """Write the least squares solution for the free inputs to s, and the residual to b.
 
-    First, the columns of the free inputs from the index `kept` on are added to the QR factor.
+    First, the QR factors are extended by the columns of the free inputs from `order[kept]` on.
     """
     s, x, Q, R, b, y = problem.s, problem.x, problem.Q, problem.R, problem.b, problem.y
     order, A, count = problem.order, problem.A, len(problem.s)
     rows = size + count
-    # The residual without the free inputs: `wanted` minus the force of the inputs at their bounds.
+    # Write the residual without the free inputs: `wanted` minus the force of all inputs that are at
+    # their bounds.
     b[:] = 0.0
     write_scaled(problem.wanted, 0, 1.0, b[:size])
     for j in range(count):
         if problem.state[j] != _FREE and x[j] != 0.0:
             b[size + j] = -LEAST * x[j]
             add_row(b, 0, -x[j], A, j * size, size)
-    # Each new column of the factor is orthogonal to the columns before it.
+    # Extend Q by unit vectors, each orthogonal to all vectors before it.
     for at in range(kept, free):
         j = order[at]
         column = Q[at * rows : (at + 1) * rows]
@@ -306,7 +320,10 @@ def _fit(problem, size, free, kept):
 
 @called
 def _steepest(problem, size):
-    """Return the untried input whose release reduces the error fastest; -1 if there is none."""
+    """Return the input at a bound whose release reduces the cost fastest; -1 if there is none.
+
+    Inputs that were tried and could not leave their bounds are excluded.
+    """
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A[: len(state) * size], size, b, slopes)
     for j in range(len(state)):
@@ -320,9 +337,12 @@ def _steepest(problem, size):
 
 
 def nearest(A, b, least, most):
-    """Return the smallest u (k,) within its bounds (k,) for which A u is nearest to b."""
+    """Return the u (k,) for which A u is nearest to b, within the bounds `least` and `most` (k,).
+
+    If several u are equally near, the smallest u is returned.
+    """
     numbers, size = [0.0] * len(least), len(b)
-    # The entries of a list are read faster than the entries of an array.
+    # Lists are used because reading an entry of a list is faster than reading one of an array.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(
         columns=np.concatenate((A.T.ravel(), b)),
         state=[0] * len(least),

@@ -1,10 +1,10 @@
 """Inertia M by composite rigid bodies, and accelerations and forces of the bodies by RNEA.
 
-All vectors are in base axes, so no vector is rotated from joint to joint. Moments are about the
-joints. About the base's origin, the inertia of a light tool on a long arm would lose digits. Row i
-of the packed M holds the nonzero entries up to the diagonal. Their columns are the coordinates on
-the path from the base to i. If a coordinate is on this path, its own path is the beginning of this
-path.
+All vectors are in base axes, so no vector is rotated from joint to joint. Moments and inertias of a
+body are about its joint. If they were about the base's origin, the inertia of a light tool on a
+long arm would lose digits. Row i of the packed M holds the nonzero entries of this row up to the
+diagonal. Their column indices are the coordinates on the path from the base to coordinate i. The
+path to any of these coordinates is the first part of the path to i.
 
 References
 ----------
@@ -15,17 +15,19 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.tree import INERTIA, LOAD, MOTION, PLACE
 from fflin.kernel.vectors import load, store
 
-# Offsets of the motion vectors of each body: velocity, Psi', acceleration if c = 0, acceleration
-# that c adds, and Psi''. Here c is the acceleration of the coordinates (3.1).
+# Offsets of the motion vectors of each body: velocity, Psi', acceleration for c = 0, the
+# acceleration that c adds to it, and Psi''. Here c is the acceleration of the coordinates (3.1).
+# Psi' and Psi'' are defined in `kernel.derivatives`.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
-# Offsets of the quantities of each joint's subtree: momentum p, columns of G, stored momentum h,
-# moment and force (FORCE), and the moment and force that the accelerations c cause (CARRIED). FORCE
-# excludes the effect of c until `accelerate_bodies` adds it.
+# Offsets of the loads of the subtree beyond each joint. The momentum p, the columns of G and the
+# stored momentum h are defined in `kernel.derivatives`. FORCE is the moment and force that the
+# motion of the subtree requires, first for c = 0. CARRIED is the moment and force that c requires;
+# `accelerate_bodies` adds it to FORCE.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
 def _inertia(work, at, place, bodies, first):
-    """Write a body's inertia about its joint in base axes: m, m c, and R I R^T."""
+    """Write a body's inertia in base axes: mass m, first moment, and inertia about its joint."""
     axes = vec.get_columns(work, place)
     store(work, at, load(bodies, first))
     vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
@@ -39,7 +41,7 @@ def _inertia(work, at, place, bodies, first):
 
 
 def spatial_inertia_times(work, at, motion):
-    """Return a spatial inertia times a motion vector, as moment and force."""
+    """Return the product (moment, force) of the spatial inertia at `at` and a motion vector."""
     m, h = load(work, at), vec.get3(work, at + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
     w, v = motion
@@ -48,7 +50,7 @@ def spatial_inertia_times(work, at, motion):
 
 
 def outwards(work, tree, q):
-    """Write the poses and the inertias of all bodies, from the base outwards."""
+    """Write the poses and the inertias of all bodies at q, from the base to the tips."""
     places, own = tree.places, tree.own
     vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
@@ -76,7 +78,7 @@ def outwards(work, tree, q):
 
 
 def inwards(work, tree):
-    """Write the packed M, its diagonal and the composite inertias, from the tips inwards."""
+    """Write the packed M, its diagonal and the composite inertias, from the tips to the base."""
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
     vec.clear(work, packed, len(tree.path))
@@ -88,7 +90,7 @@ def inwards(work, tree):
         z = vec.get3(work, place + 6)
         axis = vec.times(z, tree.turns[body]), vec.times(z, tree.slides[body])
         moment, force = spatial_inertia_times(work, at, axis)
-        # Add the composite inertia, expressed at the parent's joint, to the parent's inertia.
+        # Convert the composite inertia to the parent's joint, and add it to the parent's inertia.
         m, h, d = load(work, at), vec.get3(work, at + 1), vec.get3(work, place + 9)
         (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
         e = vec.plus(h, vec.times(d, m))
@@ -113,7 +115,8 @@ def inwards(work, tree):
         row = vec.times6((moment, force), tree.share[pair])
         vec.add6(work, packed + tree.target[pair], row)
         pair += 1
-    # The base's rigid-body block (I, [m c]x, m), packed as rows of a chain of six coordinates.
+    # Write the base's rigid-body block of M: inertia, first moment of mass, and mass of the robot.
+    # It is packed like a chain of six coordinates.
     m = load(work, inertias)
     hx, hy, hz = vec.get3(work, inertias + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, inertias + 4)
@@ -128,7 +131,10 @@ def inwards(work, tree):
 
 
 def factorise(work, tree):
-    """Factorise M = L^T D L: replace M by the unit triangular L, and write 1 / D at `scaled`."""
+    """Factorise the packed M = L^T D L: replace M by the unit lower triangular L.
+
+    The entries of 1 / D are written at `scaled`, in the places of the diagonal.
+    """
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -145,7 +151,7 @@ def factorise(work, tree):
 
 
 def solve_inwards(work, tree, x, first):
-    """Replace a force f at the index `first` of x by L^-T f; M must be factorised."""
+    """Replace the generalised force f, which begins at x[first], by L^-T f after `factorise`."""
     for k in range(len(tree.row) - 1, -1, -1):
         value, row = load(x, first + k), tree.row[k]
         for t in range(tree.depth[k]):
@@ -154,7 +160,7 @@ def solve_inwards(work, tree, x, first):
 
 
 def solve(work, tree, x):
-    """Replace a force f at the offset x by M^-1 f; M must be factorised."""
+    """Replace the generalised force f, which begins at work[x], by M^-1 f after `factorise`."""
     packed = tree.packed
     solve_inwards(work, tree, work, x)
     for k in range(len(tree.row)):
@@ -166,7 +172,7 @@ def solve(work, tree, x):
 
 
 def invert_factor(work, tree):
-    """Replace L by U = L^-1, and write V = L^-1 D^-1."""
+    """Replace L by U = L^-1, and write V = L^-1 D^-1 at `scaled`, after `factorise`."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row)):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -182,7 +188,7 @@ def invert_factor(work, tree):
 
 
 def multiply(work, tree, judged):
-    """Write M^-1 = U D^-1 U^T, and write the sum of M_ii (M^-1)_ii at `judged`."""
+    """Write M^-1 = U D^-1 U^T at `square`, and the sum of all M_ii (M^-1)_ii at `judged`."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size, coupling = len(tree.row), 0.0
     for i in range(size):
@@ -200,31 +206,40 @@ def multiply(work, tree, judged):
 
 
 def joint_axis(work, tree, body):
-    """Return the spatial axis of a joint, angular and linear, per unit of its coordinate."""
+    """Return the motion (angular, linear) of a joint per unit rate of its coordinate."""
     z = vec.get3(work, tree.places + (body * PLACE + 6))
     share = tree.factor[body]
     return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
 
 
 def motion_cross(velocity, along):
-    """Return `velocity` x `along`: the rate of a motion vector that is fixed in a body."""
+    """Return the spatial cross product `velocity` x `along`.
+
+    It is the time derivative of a motion vector `along` that is fixed in a body with this velocity.
+    """
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
 def at_joint(work, at, place):
-    """Read the parent's motion vector at the offset `at`, and shift it to a joint's origin."""
+    """Return the parent's motion vector, which is at the offset `at`, at the joint's origin.
+
+    `place` is the offset of the joint's pose.
+    """
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
 def at_parent(work, place, force):
-    """Shift a spatial force from a joint's origin to the origin of its parent."""
+    """Return a spatial force about the parent's origin; the given moment is about the joint."""
     return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
 def move_bodies(work, tree, nu):
-    """Write the velocities for v_b = 0, and the accelerations for c = 0, from the base outwards."""
+    """Write the velocities, Psi' and the accelerations of all bodies, from the base to the tips.
+
+    The velocities are for v_b = 0, and the accelerations are for c = 0.
+    """
     vec.clear(work, tree.motion, MOTION)
     vec.put3(work, tree.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):
@@ -242,7 +257,10 @@ def move_bodies(work, tree, nu):
 
 
 def load_bodies(work, tree):
-    """Write the inertial force of each single body if c = 0, including its gyroscopic torque."""
+    """Write the moment and force that the motion of each single body requires for c = 0.
+
+    The moment includes the gyroscopic torque of stored momentum.
+    """
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD + FORCE
         moving = tree.motion + body * MOTION
@@ -259,21 +277,24 @@ def load_bodies(work, tree):
 
 
 def load_carried(work, tree, u):
-    """Subtract the body-fixed wrenches of inputs from the forces of the bodies."""
+    """Subtract the wrenches of body-fixed inputs u from the forces of the bodies."""
     for index in range(len(tree.wrench_body)):
         push = vec.times6(carried_wrench(work, tree, index), -load(u, tree.input[index]))
         vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
 
 
 def collect_momenta(work, tree):
-    """Write the momentum, the moments G and the stored momentum of each subtree."""
+    """Write the momentum p, the matrix G and the stored momentum h of each subtree.
+
+    They are defined in `kernel.derivatives`. CARRIED is set to zero.
+    """
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD
         own = tree.own + body * INERTIA
         w, v = vec.get6(work, tree.motion + body * MOTION + VELOCITY)
         h = vec.get3(work, own + 1)
         vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
-        # The matrix of second moments of mass is tr(I) / 2 times the identity, minus I.
+        # The second moments of mass, the sum of m r r^T, are tr(I) / 2 times the identity, minus I.
         (xx, xy, xz), (yy, yz, zz) = vec.get6(work, own + 4)
         trace = 0.5 * (xx + yy + zz)
         second = (trace - xx, -xy, -xz), (-xy, trace - yy, -yz), (-xz, -yz, trace - zz)
@@ -299,27 +320,27 @@ def collect_momenta(work, tree):
 
 
 def stored_momentum(work, tree, index):
-    """Return a stored momentum in base axes."""
+    """Return the stored momentum with an index, in base axes."""
     axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
     return vec.product(axes, vec.get3(tree.stored, 3 * index))
 
 
 def carried_wrench(work, tree, index):
-    """Return the wrench of a unit body-fixed input about its body's joint, in base axes."""
+    """Return the wrench of a body-fixed unit input, in base axes and about its body's joint."""
     axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
     moment, force = vec.get6(tree.wrench, 6 * index)
     return vec.product(axes, moment), vec.product(axes, force)
 
 
 def add_column(work, at, width, force):
-    """Add a moment and a force to the first six rows of a column, the rows of the base."""
+    """Add (moment, force) to the base's six rows of a column; the matrix has `width` columns."""
     for index in range(3):
         vec.add(work, at + index * width, force[0][index])
         vec.add(work, at + (3 + index) * width, force[1][index])
 
 
 def write_columns(work, tree):
-    """Write the generalised force per unit of each body-fixed input."""
+    """Write the generalised forces of body-fixed unit inputs, as columns of B_u."""
     count = len(tree.wrench_body)
     vec.clear(work, tree.columns, len(tree.row) * count)
     for index in range(count):
@@ -333,7 +354,10 @@ def write_columns(work, tree):
 
 
 def collect(work, tree):
-    """Sum the bodies' forces over subtrees, from the tips inwards, and write the bias forces."""
+    """Sum the bodies' forces over each subtree, and write the generalised bias forces.
+
+    The sums start at the tips.
+    """
     vec.clear(work, tree.bias, len(tree.row))
     for body in range(len(tree.parent) - 1, 0, -1):
         force = vec.get6(work, tree.load + body * LOAD + FORCE)
@@ -345,7 +369,10 @@ def collect(work, tree):
 
 
 def accelerate_bodies(work, tree):
-    """Add the contributions of c to accelerations and Psi'' (outwards) and to forces (inwards)."""
+    """Write Psi'' and the accelerations that c adds, and add the forces that c requires.
+
+    The accelerations are computed from the base to the tips, the forces from the tips to the base.
+    """
     vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
     for body in range(1, len(tree.parent)):
         at = tree.motion + body * MOTION

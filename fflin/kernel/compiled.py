@@ -1,4 +1,4 @@
-"""The compiled kernel: its functions, their stored machine code, and the available cores."""
+"""The compiled kernel: its functions, their machine code on disk, and the available cores."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ from fflin.base.process import Progress
 if TYPE_CHECKING:
     from fflin.kernel.machine_code import Compiled
 
-# Linux files that contain a container's quota of computing time and the quota's period [us]. The
-# first line is for control groups version 2, the second for version 1.
+# Linux files that contain a container's quota of computing time [us], and then the period [us] to
+# which the quota applies. The first tuple is for control groups version 2, the second for version
+# 1.
 _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
@@ -31,17 +32,18 @@ _QUOTAS = (
 
 ENGINES = ("python", "compiled")
 
-# Functions that Python calls in compiled code.
+# {name of a kernel function that Python calls: description of this function in messages}.
 _COMPILED = {
     "advance": "the loop that simulates eight runs at a time",
     "derive": "the batch kernel",
     "take": "the run statistics",
 }
 
-# Version of Python, as in the names of numba's cache files.
+# Version of Python, written as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
-# Time [s] to wait for another process's compilation before logging it, and the longest wait [s].
+# Times [s] to wait while another process compiles. After the first, a message is logged. After the
+# second, the wait ends.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
 _INTERVAL = 1.0  # [s] between updates of the time that a terminal shows during a compilation
 
@@ -50,13 +52,16 @@ _TURN, _COMPILING = Lock(), RLock()
 
 
 def available_cores() -> int:
-    """Return the number of cores of this process, by CPU affinity and container quota."""
+    """Return the number of cores that this process may use.
+
+    It is limited by the CPU affinity of the process and by the quota of its container.
+    """
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
     cores = len(os.sched_getaffinity(0))
     for names in _QUOTAS:
         try:
-            quota, period = " ".join(Path(name).read_text() for name in names).split()
+            quota, period = " ".join(map(Path.read_text, map(Path, names))).split()
         except (OSError, ValueError):
             continue
         if quota not in ("max", "-1"):
@@ -70,10 +75,10 @@ def numba_is_there() -> bool:
 
 
 def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
-    """Return whether compiled code computes: if `engine` is not "python", and there is no obstacle.
+    """Return whether to use compiled code: `engine` is not "python", and there is no obstacle.
 
-    `obstacle` returns the reason why compiled code cannot compute, or an empty text. An error is
-    raised for an unknown engine, and for the engine "compiled" if there is an obstacle.
+    `obstacle` returns the reason why compiled code cannot be used, or an empty text. Raise an error
+    for an unknown engine, and for the engine "compiled" if there is an obstacle.
     """
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
@@ -86,7 +91,10 @@ def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
 
 
 def kernel(module: str, name: str) -> Compiled:
-    """Return a function of the kernel, whose machine code is stored on disk at its first call."""
+    """Return a compiled function of the kernel.
+
+    Its first call compiles it and stores the machine code on disk, or loads the stored code.
+    """
     with _TURN:  # several threads may call this function at the same time
         return _prepared(module, name)
 
@@ -103,8 +111,9 @@ def _prepared(module: str, name: str) -> Compiled:
             entry.unlink(missing_ok=True)
 
     def compile_alone(signature: object) -> object:
-        """Compile for a signature; if another process has compiled it meanwhile, load its code."""
-        # _COMPILING admits one thread, so no thread waits for a file lock of its own process.
+        """Compile for a signature, or load the code that another process has stored meanwhile."""
+        # A thread of this process must not wait for a file lock that another of its threads holds.
+        # So `_COMPILING` admits only one thread at a time.
         with _COMPILING, _between_processes(lock):
             if _stored(folder, module, name)[0]:
                 return compile(signature)
@@ -122,7 +131,7 @@ def _prepared(module: str, name: str) -> Compiled:
 
 @contextmanager
 def _seconds_shown(what: str) -> Iterator[None]:
-    """Show the elapsed seconds of a compilation on a terminal."""
+    """Show the elapsed time [s] of a compilation on a terminal, until the context ends."""
     done, begun, bar = Event(), time.monotonic(), Progress()
 
     def count() -> None:
@@ -140,14 +149,15 @@ def _seconds_shown(what: str) -> Iterator[None]:
 
 
 def _between_processes(path: Path) -> ExitStack:
-    """Hold the file lock of a function's machine code until the returned context ends.
+    """Hold the file lock at `path` until the returned context ends.
 
-    The system frees the lock if the process dies. There is no lock if the package filelock is
-    missing, if the folder is not writable, or after a long wait. At worst, two processes then
-    compile the same function.
+    The lock keeps other processes from compiling the same function. The operating system frees the
+    lock if this process dies. No lock is held if the package filelock is missing, if the folder is
+    not writable, or after a wait of `_LONGEST_WAIT`. At worst, two processes then compile the same
+    function.
     """
     held = ExitStack()
-    # An OSError may be the `Timeout` of the second wait.
+    # `Timeout` is an OSError. So if the second wait ends without a lock, this is suppressed too.
     with suppress(ImportError, OSError, NotImplementedError):
         from filelock import FileLock, Timeout
 
@@ -164,15 +174,20 @@ def _between_processes(path: Path) -> ExitStack:
 
 
 def is_kept(module: str, name: str) -> bool:
-    """Return whether the machine code of a function for the current sources is on disk."""
+    """Return whether machine code of a function that fits the current sources is on disk."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_stored(folder, module, name)[0] for folder in folders)
 
 
 def _stored(folder: Path, module: str, name: str) -> tuple[list[Path], list[Path]]:
-    """Return the machine code's index files for this Python: newer than all sources, and others."""
-    # numba checks the age of the function's own file only, not of the files of called functions.
+    """Return the index files of a function's machine code for this version of Python.
+
+    The first list has the files that are newer than all sources of the kernel. The second list has
+    the older files.
+    """
+    # The machine code also contains called functions of other source files. numba compares its age
+    # only with the source file of the function itself, so all source files are compared here.
     source = max(file.stat().st_mtime for file in Path(__file__).parent.glob("*.py"))
     newer: list[Path] = []
     older: list[Path] = []

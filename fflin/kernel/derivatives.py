@@ -1,9 +1,9 @@
-r"""M^-1, accelerations and their derivatives at many points, with eight points per instruction.
+r"""M^-1, accelerations and their derivatives at many points, eight points at a time.
 
 RNEA is differentiated in closed form. Let S be the spatial axis of a joint, and let v and a be the
-velocity and acceleration of its parent. Define Psi' = v x S and Psi'' = a x S + v x Psi'. If joint
-j is on the path from the base to joint i, the derivatives of the joint forces tau with respect to
-the positions q and velocities q' are
+spatial velocity and acceleration of the joint's parent. Define Psi' = v x S and
+Psi'' = a x S + v x Psi'. If joint j is on the path from the base to joint i, the joint forces tau
+have the following derivatives with respect to the joint positions q and velocities q':
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
@@ -11,10 +11,12 @@ the positions q and velocities q' are
     \partial\tau_i/\partial q_j &= (2 B_i^T S_i)^T \Psi'_j + (I_i S_i)^T \Psi''_j \\
     \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
 
-where I_i, B_i and f_i are the inertia, the Coriolis matrix and the force of joint i's subtree. Let
-p be the momentum of the subtree, h its stored momentum, and G = sum m v r^T its first moments of
-momentum about the joint. For a rotation with the angular velocity w, the force part of 2 B w is
-2 w x p, and its moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
+Here I_i, B_i and f_i are the inertia, the Coriolis matrix and the spatial force of the subtree
+beyond joint i. Let p be the linear momentum of the subtree, and h its stored momentum, which is the
+sum of the momenta of its wheels without inertia. The matrix G = sum m v r^T sums over the mass
+points of the subtree, at the positions r from the joint. For a rotation with the angular velocity
+w, the force part of 2 B w is 2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the
+identity matrix E.
 
 References
 ----------
@@ -39,7 +41,7 @@ from fflin.kernel.vectors import load, store
 
 
 def _coriolis(work, at, w):
-    """Return the moment and force 2 B w of a joint's subtree."""
+    """Return 2 B w (moment, force) of a joint's subtree for the angular velocity w."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
@@ -49,7 +51,7 @@ def _coriolis(work, at, w):
 
 
 def _coriolis_transposed(work, at, along):
-    """Return the moment of 2 B^T s for a motion vector s; the force of 2 B^T s is zero."""
+    """Return the moment part of 2 B^T s for a motion vector s; the force part is zero."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
@@ -59,7 +61,10 @@ def _coriolis_transposed(work, at, along):
 
 
 def differentiate(work, tree):
-    """Write the derivatives of M c + bias - forces over the state, in rows of 12 + 2 n."""
+    """Write the derivatives of M c + b - B_u u minus spring and damper forces, at constant c.
+
+    The matrix (6 + n, 12 + 2 n) has one column for each displacement of the state in base axes.
+    """
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
     vec.clear(work, tree.lower, len(tree.row) * width)
@@ -67,7 +72,8 @@ def differentiate(work, tree):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
-    # Derivatives of all forces over each joint, and derivatives of each joint's force over omega_b.
+    # For each joint, write the derivatives of all forces over its position and rate, and the
+    # derivatives of its force over omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         moving = tree.motion + body * MOTION
@@ -105,7 +111,7 @@ def differentiate(work, tree):
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         bodies.add_column(work, tree.lower + column, width, by_q)
         bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
-    # Derivatives of the base's force over omega_b.
+    # Write the derivatives of the base's moment and force over omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
@@ -115,7 +121,10 @@ def differentiate(work, tree):
 
 
 def _push(work, tree, by_u):
-    """Write the acceleration per unit input: a column of M^-1, or a combination of its columns."""
+    """Write D_u (3.3), the acceleration c per unit of each input.
+
+    It is a column of M^-1, or M^-1 times a column of B_u for a body-fixed input.
+    """
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
     for row in range(size):
         for index in range(count):
@@ -131,10 +140,14 @@ def _push(work, tree, by_u):
 
 
 def _solve(work, tree, slopes):
-    """Write -M^-1 times the derivatives of the forces, six columns at a time."""
+    """Write the derivatives of c, which are -M^-1 times the matrix that `differentiate` writes.
+
+    Six columns are computed at a time.
+    """
     size, width = len(tree.row), 2 * len(tree.row)
     none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    # The first six columns, over the base's rotation and translation, are zero.
+    # The first six columns are for the base's rotation and translation. They are zero, because the
+    # kernel supports no orbits.
     for row in range(size):
         vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
@@ -150,21 +163,27 @@ def _solve(work, tree, slopes):
 
 
 def _pack(rows, first, lanes):
-    """Copy the rows of eight points into an array (entries, lanes)."""
+    """Copy eight rows, from `first` on, to the eight columns of `lanes` (entries, 8)."""
     for entry in range(len(lanes)):
         for lane in range(LANES):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
 def _unpack(work, start, entries, out, first, offset):
-    """Copy entries of a laned array to the rows of eight points, from column `offset` on."""
+    """Copy entries of `work` (.., 8), from `start` on, to eight rows of `out` from `first` on.
+
+    In these rows, the entries begin at the column `offset`.
+    """
     for entry in range(entries):
         for lane in range(LANES):
             out[first + lane, offset + entry] = work[start + entry, lane]
 
 
 def derive(tree, points, out, lanes, work):
-    """Write the results of `RowAccelerations` at eight or more points; `nu` is empty at rest."""
+    """Write the results of `RowAccelerations` to `out` at eight or more points.
+
+    For points at rest, `nu` is empty, and only D_u and the couplings are written.
+    """
     q, nu, force, u = points
     c, A, by_u, judged = out
     size = len(tree.row)
@@ -172,8 +191,8 @@ def derive(tree, points, out, lanes, work):
     inputs = slopes + size * 2 * size
     coupling = inputs + size * len(tree.driven)
     for block in range(0, len(q), LANES):
-        # If the last block has fewer than eight points, it overlaps the block before and fills all
-        # lanes.
+        # The last block begins earlier if fewer than eight points are left. So it fills all lanes,
+        # and computes some points of the block before again.
         first = min(block, len(q) - LANES)
         _pack(q, first, lanes.q)
         bodies.outwards(work, tree, lanes.q)
@@ -212,15 +231,16 @@ _FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is ac
 
 
 class Packed(namedtuple("Packed", "q nu force u")):
-    """Arrays of eight points; their second axis is the lane."""
+    """Arrays (entries, 8) of q, nu, force and u at eight points, one column for each point."""
 
 
 class RowAccelerations:
-    """Accelerations at rows of points, their derivatives and M^-1, by the compiled kernel.
+    """Accelerations c and their derivatives at N points, computed by the compiled kernel.
 
-    Its methods return a mask (N,) of the points with accurate results. There, M is well-conditioned
-    and all angles are below 1e6 rad. The sum of the couplings M_ii (M^-1)_ii (`judged`) measures
-    the accuracy of M^-1; see `dynamics.rnea`.
+    Both `write` and `write_inverse` return a mask (N,) that is true at points with accurate
+    results. At these points, M is well-conditioned, and all joint angles are below 1e6 rad in
+    magnitude. The sum of the couplings M_ii (M^-1)_ii shows whether M is well-conditioned; see
+    `dynamics.rnea`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
@@ -231,17 +251,18 @@ class RowAccelerations:
         self._least_coupling = 0.999 * nv
 
     def write_inverse(self, q: Array, by_u: Array) -> Mask:
-        """Write the derivatives over u (N, 6 + n, nu)."""
+        """Write D_u of (3.3) to `by_u` (N, 6 + n, nu); return the mask."""
         none = np.empty((0, 0))
         return self._derive((q, none, none, none), none, none, by_u)
 
     def write(
         self, q: Array, nu: Array, q_m: Array, u: Array, A: Array, by_u: Array
     ) -> tuple[Array, Mask]:
-        """Write the derivatives of the accelerations; return c (N, 6 + n) and the mask.
+        """Write the derivatives of the accelerations c; return c (N, 6 + n) and the mask.
 
-        The lower half of each A (N, nx, nx) gets the derivatives over the state. A and by_u are
-        C-contiguous; nu and u are in base axes.
+        The derivatives over displacements of the state are written to the lower half of each matrix
+        in A (N, nx, nx), and D_u to `by_u`. Both arrays are C-contiguous. nu and u are in base
+        axes.
         """
         force = u @ self._actuation.fixed.T
         force[:, 6:] += self.state.robot.springs.force(q_m, nu[:, 6:])
@@ -252,13 +273,13 @@ class RowAccelerations:
         judged = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,
-            # numba would compile a second function for read-only arrays.
+            # Read-only arrays are copied, because numba would compile a second function for them.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
             (c, A, by_u.reshape(len(by_u), -1), judged),
             Packed(*map(work_space, self._sizes)),
             work_space(self._work),
         )
-        # A zero pivot gives NaN, and comparisons with NaN are false.
+        # If a pivot of M is zero, `judged` is NaN, and both comparisons are false.
         good = (self._least_coupling < judged) & (judged < WARNING_COUPLING)
         q_m = points[0][:, 7:]
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:

@@ -1,13 +1,14 @@
 r"""Forward dynamics of a robot with its inputs, springs and gravity, and its first integrals.
 
-Accelerations follow from the M of CRBA, the bias forces of RNEA and a factor of M. All vectors are
-in base axes. Position and linear velocity of the base are left out, because the accelerations c of
-(3.1) do not depend on them. Momentum and centre of mass follow from the external impulse,
+The accelerations c solve (3.1), with M from the composite rigid body algorithm and the bias from
+RNEA. All vectors in this computation are in base axes. It does not use the position and the linear
+velocity of the base, because c does not depend on them. Momentum and centre of mass follow from the
+external wrench W by (11.2) of docs/derivation.md, as in `simulation.run`:
 
-.. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
+.. math:: H(t) = H(0) + \int W\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-(11.2) of docs/derivation.md, as in `simulation.run`. H is linear momentum, then angular momentum
-about the initial position of the base's origin. Positions are relative to this point.
+H contains the linear momentum p, and then the angular momentum about the initial position of the
+base's origin. The centre of mass r_c is relative to the same point. Both are in world axes.
 """
 
 from collections import namedtuple
@@ -25,39 +26,49 @@ class Mechanics(
         "tree gravity index circling scale springy rest held triads origin faults",
     )
 ):
-    """Robot parameters of the loop; each array of doubles may have a second axis of eight lanes.
+    """Parameters of a robot in the simulation loop.
 
-    - `gravity` (3,).
-    - `index`, `circling`: for each joint, its entry of q, and whether it is the cosine of an angle.
+    Each array of doubles may have a second axis of eight lanes.
+
+    - `tree`: the kinematic tree.
+    - `gravity` (3,): gravity in world axes [m/s^2].
+    - `index`: for each joint, the index of its first entry in q.
+    - `circling`: for each joint, whether this entry is the cosine of its angle.
     - `scale`: for each joint, the change of this entry per unit of q_m. It is 1 except for modal
       amplitudes.
-    - `springy`, `rest`: for each joint, whether it has a spring or damper, and the position at
-      which the spring is relaxed.
-    - `held`: the index of the first of the three inputs of each torque or force on the base in
-      reference axes. `triads`: the same indices for torques and forces in any axes.
-    - `origin` (7,): placement of the world's origin relative to the reference.
+    - `springy`: for each joint, whether it has a spring or a damper.
+    - `rest`: for each joint, the position at which its spring exerts no force.
+    - `held`: for each torque or force on the base in reference axes, the index of the first of its
+      three inputs.
+    - `triads`: for each torque or force on the base in any axes, the index of the first of its
+      three inputs.
+    - `origin` (7,): placement of the world relative to the reference, as position and quaternion.
     - `faults`: the `ActuatorFaults`.
     """
 
 
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
-    """Actuator faults: the input is gain u + bias (nu,) for a command u, and 0 after `until` [s].
+    """Actuator faults: a command u produces the inputs gain u + bias (nu,).
 
-    For each vector on the base, `turn` holds the three columns (9,) of a matrix: the directions in
-    which the vector's inputs actually act.
+    Each input is 0 from the time `until` [s] on. For each torque or force on the base, `turn` holds
+    the three columns (9,) of a matrix. They are the directions in which the three inputs of this
+    vector actually act.
     """
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
-    """Point of a robot: q (nq,), nu (6 + n,) in base axes, and inputs (nu,).
+    """Point of a robot: q (nq,), nu (6 + n,) in base axes, and inputs.
 
-    `u` are the commanded inputs, and `pushing` the acting inputs in base axes. `wrench` (6,) is the
-    moment and force of the inputs on the base's origin at the last evaluation of accelerations.
+    - `u` (number of inputs,): the commanded inputs.
+    - `pushing` (number of inputs,): the inputs after faults, with the vectors on the base in base
+      axes.
+    - `wrench` (6,): moment and force of the inputs about the base's origin, in base axes. It is
+      from the last evaluation of the accelerations.
     """
 
 
 class CommonPoint(Point):
-    """Point that is common to all lanes."""
+    """Point whose arrays have no axis of lanes, because all lanes have the same point."""
 
 
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
@@ -68,13 +79,13 @@ MECHANICS = Struct(Mechanics, INDICES, _OF_MECHANICS, tree=TREE, faults=ACTUATOR
 
 @called
 def configure(work, robot, q):
-    """Write the poses of all bodies and the packed M at a configuration."""
+    """Write the poses of all bodies and the packed M at the configuration q."""
     bodies.outwards(work, robot.tree, q)
     bodies.inwards(work, robot.tree)
 
 
 def joint_position(robot, q, joint):
-    """Return the position of a joint; the angle of a continuous joint is in (-pi, pi]."""
+    """Return the position of a joint at q; the angle of a continuous joint is in (-pi, pi]."""
     at = robot.index[joint]
     value = load(q, at)
     if robot.circling[joint]:
@@ -83,7 +94,7 @@ def joint_position(robot, q, joint):
 
 
 def apply_faults(faults, triads, t, u, given):
-    """Write the inputs that faulty actuators produce for a command u at a time t."""
+    """Write to `given` the inputs that the actuators produce for a command u at a time t [s]."""
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
         store(given, index, chosen(t, load(faults.until, index), value, 0.0))
@@ -93,7 +104,7 @@ def apply_faults(faults, triads, t, u, given):
 
 
 def turn_held(robot, point):
-    """Rotate reference-frame wrenches to base axes."""
+    """Rotate the torques and forces in reference axes of `point.pushing` to base axes, in place."""
     pushing = point.pushing
     for index in range(len(robot.held)):
         at, turn = robot.held[index], vec.attitude(robot.origin)
@@ -104,8 +115,8 @@ def turn_held(robot, point):
 def push(work, tree, pushing):
     """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
 
-    Forces and torques on the base in `pushing` are in base axes. `bodies.write_columns` must have
-    written the columns of body-fixed inputs.
+    Torques and forces on the base in `pushing` are in base axes. `bodies.write_columns` must be
+    called before, because `push` reads the columns that it writes.
     """
     size, count = len(tree.row), len(tree.wrench_body)
     vec.clear(work, tree.c, size)
@@ -120,9 +131,9 @@ def push(work, tree, pushing):
 
 @called
 def accelerate(work, robot, point, rates, to):
-    """Write d(nu)/dt into `rates` from the index `to` on; `configure` must have computed M.
+    """Write d(nu)/dt into `rates` from the index `to` on.
 
-    M is overwritten by its factor.
+    `configure` must be called before. M is overwritten by its factor.
     """
     tree, nu = robot.tree, point.nu
     force, size = tree.c, len(tree.row)
@@ -143,27 +154,30 @@ def accelerate(work, robot, point, rates, to):
     bodies.factorise(work, tree)
     bodies.solve(work, tree, force)
     vec.copy(work, force, rates, to, size)
-    # dv_b/dt also contains gravity and -omega_b x v_b.
+    # By (3.2), dv_b/dt is the linear part of c plus gravity, minus omega_b x v_b.
     fall = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
     fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Offsets in `sums`: the impulse and the displacement of the centre of mass, first up to the current
-# step, then within it.
+# Offsets in `sums` of `MomentumReference`. IMPULSE and SHIFT are for the time up to the current
+# step, STEP_IMPULSE and STEP_SHIFT are for the current step.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
 
 class MomentumReference(namedtuple("MomentumReference", "start weight per_mass sums")):
-    """Reference of momentum and centre of mass; arrays of doubles may have a second axis of lanes.
+    """Momentum and centre of mass that the robot must have by (11.2).
 
-    - `start` (12,): initial momentum (6,) and centre of mass (3,), and the point (3,) to which both
-      are relative.
+    All vectors are in world axes. The arrays may have a second axis of lanes.
+
+    - `start` (12,): the initial momentum (6,), the initial centre of mass (3,), and a point (3,).
+      Angular momentum and centre of mass are relative to this point.
     - `weight` (3,): mass times gravity.
-    - `sums` (18,): the impulse (6,), and the displacement (3,) of the centre of mass that the
-      impulse causes. The first nine entries cover the time up to the current step, the other nine
-      the step itself.
+    - `per_mass` (1,): 1 / mass.
+    - `sums` (18,): the impulse (6,) up to the current step, and the displacement (3,) of the centre
+      of mass by this impulse. Then the impulse (6,) within the step, and the mass times the
+      displacement (3,) by it.
     """
 
 
@@ -171,16 +185,18 @@ MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 
 def add_wrench(work, robot, reference, point, weight, moment):
-    """Add the external wrench at a stage to the sums of a step.
+    """Add the external wrench at a stage of the integrator to the sums of the current step.
 
-    `weight` is the stage's weight in an integral, `moment` its weight in a double integral.
+    `weight` [s] is the weight of the stage in an integral over the step, and `moment` [s^2] is its
+    weight in a double integral.
     """
     axes = vec.axes_of(point.q)
     moments, force = vec.get6(point.wrench, 0)
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
     lever = vec.product(axes, vec.get3(work, robot.tree.inertias + 1))
     force, falls = vec.product(axes, force), vec.get3(reference.weight, 0)
-    # Moment of the weight m g at the centre of mass c, where `lever` is m c.
+    # The weight m g acts at the centre of mass. Its moment about the base's origin is `lever` x g,
+    # where `lever` is m times the position of the centre of mass from the base's origin.
     torque = vec.plus(vec.product(axes, moments), vec.cross(position, vec.plus(force, falls)))
     torque = vec.plus(torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls))
     force = vec.plus(force, falls)
@@ -189,7 +205,10 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 
 def end_step(reference, h):
-    """Add the sums within a finished step of h [s] to the sums up to it, and reset the former."""
+    """Add the sums of a finished step of h [s] to the sums before it; set the sums of a step to 0.
+
+    The impulse before the step also displaces the centre of mass during the step.
+    """
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
     shift = vec.plus(shift, vec.get3(reference.sums, STEP_SHIFT))
@@ -199,7 +218,10 @@ def end_step(reference, h):
 
 
 def kept_at(reference, t):
-    """Return the reference at a time: (linear, angular) momentum, and centre of mass."""
+    """Return the (linear, angular) momentum and the centre of mass of the reference at t [s].
+
+    t must be the end of the last finished step.
+    """
     momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
     flown = vec.times(vec.get3(reference.start, 0), t * load(reference.per_mass, 0))
     shift = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, SHIFT))
@@ -207,7 +229,10 @@ def kept_at(reference, t):
 
 
 def start_at(work, robot, reference, point):
-    """Write the initial momentum and centre of mass at a point whose M is already computed."""
+    """Write the momentum and the centre of mass of the robot at its initial point to `start`.
+
+    `configure` must be called before.
+    """
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)
@@ -221,9 +246,13 @@ def start_at(work, robot, reference, point):
 
 
 def _momentum_error(work, robot, nu, momentum):
-    """Return a given (angular, linear) momentum in base axes minus the robot's momentum at nu."""
+    """Return a given momentum minus the momentum of the robot at nu.
+
+    Both are (angular, linear) in base axes, about the base's origin.
+    """
     tree = robot.tree
-    # The base rows of M nu: the base's rigid-body block, and the first six entries of each row.
+    # The momentum of the bodies is the base rows of M nu. M is symmetric, so the entries of these
+    # rows for a joint are the first six entries of the joint's row in the packed M.
     error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
     for index in range(6, len(tree.row)):
         row = vec.get6(work, tree.packed + tree.row[index])
@@ -237,8 +266,8 @@ def _momentum_error(work, robot, nu, momentum):
 def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
-    M must be evaluated at the point. Only the deviation of the momentum is solved for, so the
-    solution's rounding errors are relative to this small correction.
+    `configure` must be called before. The equations are solved for the correction of the velocity,
+    which is small. So the rounding errors of the solution are small too.
     """
     tree, nu = robot.tree, point.nu
     axes = vec.axes_of(point.q)
@@ -250,7 +279,8 @@ def impose(work, robot, reference, point, t):
     angular = vec.across(axes, vec.minus(angular, vec.cross(position, linear)))
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
-    # Solve with the base's rigid-body block of M, using the inertia about the centre of mass.
+    # Solve for the correction of omega_b with the robot's inertia about its centre of mass, and
+    # then for the correction of v_b.
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))

@@ -1,8 +1,8 @@
 """The closed loop: policy, actuator channel, steps on the manifold, and statistics of a run.
 
-The channel applies limits, sample and hold, delays, pulses and wheel speed limits to the commands
-of the policy. The Python engine and the compiled engine both call its functions; see
-`control.channel`.
+The channel changes the commands of the policy: it applies limits, sample and hold, a delay,
+thruster pulses and the speed limits of wheels. The compiled engine runs the whole loop. The Python
+engine calls only the functions of the channel (see `control.channel`) and `goes_on`.
 """
 
 from collections import namedtuple
@@ -23,29 +23,39 @@ class Wheels(
 ):
     r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
 
-    Fields of each wheel: the index of its input (`at`), the index of its speed in nu (`row`), the
-    limits of its torque [N m] and speed [rad/s], and the stiffness J / dt. Within a step of dt, a
-    torque u changes the speed w by u dt / J. J is the effective inertia between the wheel and the
-    rest of the free robot. The torque limits of the motor apply as well.
+    A torque u changes the speed w by u dt / J in a step of dt [s]. J = 1 / (M^-1)_ii is the
+    effective inertia of the wheel's joint i in the free-floating robot.
+
+    - `at`: index of the wheel's input. `row`: index of its speed in nu.
+    - `least_torque`, `most_torque` [N m]: torque limits of the motor.
+    - `least_speed`, `most_speed` [rad/s]: speed limits.
+    - `stiffness`: J / dt.
     """
 
 
 class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
     """Pulsed thrusters (k,) that realise the command of each sample by an impulse.
 
-    Fields of each thruster: the index of its input (`at`), whether it is on-off, its largest thrust
-    [N], its least impulse [N s] and the impulse of one step (`quantum`). The commanded impulse that
-    was not fired is `left` for the next sample. The thrust `level` acts until the step `end`.
-    `time` [s] is the sample time.
+    - `at`: index of the thruster's input. `on_off`: whether the thrust is either 0 or `most`.
+    - `most` [N]: largest thrust. `least` [N s]: least impulse of a pulse.
+    - `quantum` [N s]: the impulse of an on-off thruster in one step; unused for other thrusters.
+    - `left` [N s]: the commanded impulse that was not fired; it is added to the next sample.
+    - `level` [N]: the thrust of the latest pulse. `end`: the first step after this pulse.
+    - `time` [s]: the sample time.
     """
 
 
 class Channel(
     namedtuple("Channel", "low high held pending slots sample delay fresh wheels pulses")
 ):
-    """Limits (nu,) of commands, and the delayed commands `pending` (slots, nu), one per sample.
+    """Channel from commands (nu,) to inputs: limits, sample and hold, delay, wheels and pulses.
 
-    `delay` (1,) is in steps. `fresh` (1,) is 1 if a command begins to act in this step, else 0.
+    - `low`, `high` (nu,): limits of the commands.
+    - `held` (nu,): the command that acts now. `pending` (slots, nu): the commands of the latest
+      samples. Some of them have not arrived yet.
+    - `sample`: number of steps per sample, 0 for continuous commands. `delay` (1,): delay in steps.
+    - `fresh` (1,): 1 in a step in which a command arrives, else 0. It is also 1 at each sample
+      before the first arrival, so that the initial inputs are also pulsed.
     """
 
 
@@ -76,7 +86,8 @@ def is_asked(channel, step):
 def transmit(channel, step, nu, u):
     """Replace the command u by the inputs that act in this step.
 
-    u is a new command only in steps in which the policy is evaluated (`is_asked`).
+    The command is read only in steps in which the policy is evaluated (`is_asked`). nu holds the
+    velocities to which `Wheels.row` refers.
     """
     count = len(channel.low)
     if is_asked(channel, step):
@@ -84,7 +95,7 @@ def transmit(channel, step, nu, u):
         if channel.sample > 0:
             first = (step // channel.sample) % channel.slots * count
             vec.copy(u, 0, channel.pending, first, count)
-    # Write the latest command that has arrived after the delay, or its pulses.
+    # Write the latest command that has arrived. For a pulsed thruster, write its present thrust.
     if channel.sample > 0:
         any_fresh = False
         for lane in range(vec.lane_count(channel.delay)):
@@ -105,8 +116,8 @@ def transmit(channel, step, nu, u):
         for index in range(len(pulses.at)):
             level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
             store(u, pulses.at[index], level)
-    # If a torque would make a wheel exceed its speed limit in this step, reduce the torque, but do
-    # not reverse it.
+    # If a torque would make a wheel exceed its speed limit in this step, reduce the torque, at most
+    # to zero. A torque is never reversed, even if the wheel already exceeds its speed limit.
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
@@ -119,7 +130,10 @@ def transmit(channel, step, nu, u):
 
 
 def _begin_pulses(channel, step, u):
-    """Fire the pulse of a sample, and leave the remaining impulse to the next sample."""
+    """Fire the pulses of a new sample with the commands u; keep the impulse that was not fired.
+
+    Lanes in which `fresh` is 0 do not change.
+    """
     pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
@@ -132,7 +146,8 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # An impulse is also fired if it is below the least impulse only because of rounding errors.
+        # Due to the tolerance 1e-9, an impulse fires even if rounding errors make it smaller than
+        # the least impulse.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -145,27 +160,29 @@ class Method(
 ):
     """Integration method: steps of h [s] with s stages.
 
-    - `shift`: a row of weights for each stage. The displacement after the stage is the weighted sum
-      of v and the accelerations of the stages. The last row gives a second displacement after the
-      last stage.
-    - `speed`: a row of weights for each stage, which gives the velocity after it in the same way.
-    - `origin`: the stage from whose configuration each displacement starts: 0 for the first stage,
-      1 for the second.
-    - `nodes` [s]: times of the stages.
-    - `weights`: weights of the stages in an integral over the step, including h. `moments`: their
-      weights in a double integral over the step, including h^2.
-    - Work space: v and the accelerations of the stages (`rates`), a displacement (`along`), and q
-      at the `first` and the `second` stage.
-    - `u` (nu,): inputs at the beginning of the last step.
+    - `rates` (1 + s, 6 + n): work space for nu at the start of the step, followed by d(nu)/dt at
+      each stage.
+    - `shift` (s + 1, 1 + s): weights of the rows of `rates`. Row i gives the displacement after
+      stage i. After the last stage, the last two rows give two displacements in succession.
+    - `speed` (s, 1 + s): weights of the rows of `rates`. Row i gives nu after stage i.
+    - `origin` (s,): 0 if the displacement after a stage starts at q of the first stage, 1 if it
+      starts at q of the second stage.
+    - `nodes` (s,) [s]: times of the stages after the start of the step.
+    - `weights` (s,): weights of the stages in an integral over the step, including h. `moments`
+      (s,): weights of the stages in a double integral over the step, including h^2.
+    - `along`, `first`, `second`: work space for a displacement, and for q at the first two stages.
+    - `u` (nu,): inputs at the start of the latest step.
     """
 
 
 class StopConditions(namedtuple("StopConditions", "squares sign")):
-    """Stop conditions: squared limits of the rates (6 + n,), and the sign (1,) that q0 must keep.
+    """Stop conditions: limits of the velocity and of the attitude.
 
-    Here q0 is the scalar part of the base's quaternion relative to the reference. The sign is 0 if
-    the policy uses no chart, so that every attitude is allowed. In the Python engine, rates are in
-    the order of v (nv,).
+    - `squares` (6 + n,): squared limits of the entries of nu. In the Python engine, they are the
+      squared limits of the entries of v (nv,).
+    - `sign` (1,): the sign that q0 must keep, where q0 is the scalar part of the quaternion from
+      the reference to the base. If the policy uses no chart, the sign is 0, and every attitude is
+      allowed.
     """
 
 
@@ -174,8 +191,9 @@ class Arguments(
 ):
     """Arguments of `advance`.
 
-    `project` turns on the projection on the momentum reference (`forward.impose`). `pushed` turns
-    on the integration of external wrenches (`forward.add_wrench`).
+    If `project` is true, each step ends with a correction of the base, which restores momentum and
+    centre of mass (`forward.impose`). If `pushed` is true, external wrenches are integrated for
+    the momentum reference (`forward.add_wrench`).
     """
 
 
@@ -195,7 +213,11 @@ ARGUMENTS = Struct(
 
 
 def _combine(shares, row, rates, out):
-    """Write a combination of v and the accelerations of the stages."""
+    """Write the sum of the rows of `rates`, weighted by a row of `shares`.
+
+    The first row of `rates` is a value at the start of the step: nu, or the state z of a filter.
+    The other rows are its derivatives at the stages.
+    """
     size = len(out)
     count = len(rates) // size
     for index in range(size):
@@ -207,7 +229,11 @@ def _combine(shares, row, rates, out):
 
 
 def goes_on(stop, origin, q, rates):
-    """Return whether all rates are within their limits and the base is within the chart."""
+    """Return whether no velocity exceeds its limit and the base is within the chart.
+
+    `rates` are the velocities. Compiled code returns true only if both conditions are met in all
+    lanes.
+    """
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))
     good = below(-(load(stop.sign, 0) * scalar), 1e-300)
@@ -218,7 +244,10 @@ def goes_on(stop, origin, q, rates):
 
 
 def _move(robot, method, point, stage):
-    """Move the point from a stage with known acceleration to the next stage or the step's end."""
+    """Move the point from a stage to the next stage, or from the last stage to the step's end.
+
+    The accelerations up to this stage must be in `method.rates`.
+    """
     rates, along = method.rates, method.along
     if stage == 1:
         vec.copy(point.q, 0, method.second, 0, len(point.q))
@@ -232,13 +261,15 @@ def _move(robot, method, point, stage):
 
 
 def advance(words, clock, last, every, rows, work):
-    """Advance eight runs to the step `last`, or until a stop condition is met.
+    """Advance eight runs to the step `last`, or until one of them meets a stop condition.
 
-    `words` represent `Arguments`. The point, the momentum reference, and the memory of policy and
-    channel are updated. clock (1,) is the number of finished steps. At the first step, the initial
-    momentum and centre of mass are written into the momentum reference. If `every` is not 0, a row
-    is written every `every` steps. It contains q, nu, u, the reference momentum (6,) and the
-    reference centre of mass (3,). `work` has `Layout.size` entries.
+    `words` represent `Arguments`. The function updates the point, the momentum reference, the state
+    of the policy and the state of the channel. clock (1,) is the number of finished steps. Before
+    step 0, the initial momentum and centre of mass are written into the momentum reference.
+
+    If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
+    `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
+    mass (3,). `work` has `Tree.size` entries.
     """
     of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
@@ -291,18 +322,22 @@ class RunStatistics(
         "sizes largest_x largest_u largest outside errors inputs states",
     )
 ):
-    """Statistics of the errors of eight runs, and the reference of these errors.
+    """Statistics of the errors of eight runs, and the reference from which errors are measured.
 
-    - `law` computes states.
-    - Errors are relative to the state `x_ref` (nx,). Its attitude is the quaternion in
-      `path.point.q`. With a moving reference, errors are relative to the rows `q_ref` and `nu_ref`.
-    - `kind` (nx,) is the index of each state's kind, from 1 on. It is 0 for a state of no kind, and
-      -1 for a state whose error is not recorded.
-    - An error has settled when it stays below the fraction `settled` of its largest value, or below
-      `tolerance` (kinds,).
-    - Three quantities are recorded at the `steps` (times,): the errors of the kinds, the inputs,
-      and the errors of the states.
-    - `at` is work space. All fields after `at` have one column per lane.
+    - `x_ref` (nx,): the reference state. `path.point.q` contains its attitude as a quaternion.
+    - `q_ref`, `nu_ref`: with a moving reference, the rows of q and nu at all steps; else empty.
+    - `law`: the law by which `read_state` computes states.
+    - `kind` (nx,): the index of the kind to which each state belongs. One kind, for example, is all
+      joint positions. The index is 0 for the attitude and for states without a kind, and -1 for
+      states that `largest_x` ignores.
+    - `settled`, `tolerance` (kinds,): the error of a kind has settled when it stays below `settled`
+      times its largest value, or below its `tolerance`.
+    - `steps` (times,): the steps at which `errors` (of the kinds), `inputs` and `states` (errors of
+      the states) are recorded.
+    - `at`: work space for the point. All fields after `at` have one column per lane.
+    - `sizes`: the present errors of the kinds. `largest`: their largest values up to now.
+    - `largest_x`, `largest_u`: the largest magnitudes of the states' errors and of the inputs.
+    - `outside`: the last step at which the error of a kind had not settled.
     """
 
 
@@ -318,12 +353,16 @@ def _size(value):
 
 
 def _grow(stats, index, value):
-    """Replace an entry of the statistics by a value if the value is larger."""
+    """Replace an entry of `stats` by `value` if `value` is larger."""
     store(stats, index, chosen(load(stats, index), value, value, load(stats, index)))
 
 
 def _compare(stats, step):
-    """Write the errors at a step, and the largest magnitude of each kind."""
+    """Write the errors of the states and of the kinds at a step, and update `largest_x`.
+
+    The error of a kind is the largest magnitude among its states. The error of kind 0 is the angle
+    [deg] of the attitude error.
+    """
     at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
     if len(stats.q_ref) > 0:
         vec.copy(stats.q_ref, step * len(there.q), there.q, 0, len(there.q))
@@ -347,7 +386,7 @@ def _compare(stats, step):
 
 
 def take(words, rows, first, count):
-    """Update the statistics with `count` rows of `advance`, which begin at the step `first`.
+    """Update the statistics with `count` rows of `advance`, one per step from `first` on.
 
     `words` represent `RunStatistics`.
     """
@@ -364,7 +403,8 @@ def take(words, rows, first, count):
         for kind in range(len(sizes)):
             value = load(sizes, kind)
             _grow(stats.largest, kind, value)
-            # A new maximum exceeds its own bound, so it resets the settling time.
+            # A new maximum above the tolerance exceeds its own bound, so it resets the settling
+            # time.
             bound = stats.settled * load(stats.largest, kind)
             bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
             store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))

@@ -2,9 +2,9 @@
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
 machine code for each function together with all functions that it calls. A function at the end of a
-chain of ten calls would be compiled ten times. Here a part (a function called only by compiled
-functions) remains LLVM code. It becomes machine code only once, as a piece of the function that
-Python calls.
+chain of ten calls would be compiled ten times. In this module, a *part* is a function that is
+called only by compiled functions. numba keeps a part as LLVM code (LLVM's intermediate
+representation). A part becomes machine code only within the function that Python calls.
 
 The operations of `kernel.vectors` are compiled for one number or for eight numbers. An array with
 one axis holds numbers. An array with a second axis of eight holds lanes: each lane is one robot,
@@ -12,9 +12,9 @@ and one instruction computes all eight. If an operation combines lanes with a do
 stands for eight equal numbers. So a function that is written for one number can be compiled for
 eight.
 
-LLVM does not vectorise loops over arrays that may overlap. So eight numbers are one value of the
-vector type `Lanes`, whose operations LLVM compiles to vector instructions. If the registers of a
-machine are narrower, LLVM splits the eight numbers over several registers.
+LLVM does not vectorise loops over arrays that may overlap. So the eight numbers of an entry are one
+value of the vector type `Lanes`, whose operations LLVM compiles to vector instructions. If a
+processor's registers hold fewer than eight doubles, LLVM splits the value over several registers.
 """
 
 from __future__ import annotations
@@ -48,17 +48,18 @@ _DOUBLE, _INT32, _WORD = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BYTES = 8  # alignment of a double
 
-# Function that writes the code of an operation for LLVM values and returns its result.
+# Function that generates the code of an operation on LLVM values, and returns the LLVM value of the
+# operation's result.
 Generator: TypeAlias = Callable[..., ir.Value]
-# Function that returns the signature of an operation for the numba types of its arguments.
+# Function that maps the numba types of an operation's arguments to the operation's signature.
 Typer: TypeAlias = Callable[..., Signature]
 
 
 class Lanes(Type):
-    """numba type of eight doubles in one vector; a double can stand for eight equal numbers."""
+    """numba type of eight doubles in one vector; numba converts one double to eight equal lanes."""
 
     def can_convert_from(self, _: TypingContext, other: Type) -> Conversion | None:
-        """Return the kind of conversion from a double to lanes, and None for other types."""
+        """Return numba's kind of conversion if `other` is a double, and None for other types."""
         return Conversion.promote if other == float64 else None
 
 
@@ -79,13 +80,13 @@ def _spread(
 
 
 def _alike(*kinds: Type) -> Signature:
-    """Return the signature of an operation of lanes if an operand has lanes, else of doubles."""
+    """Return the signature of an operation on lanes if an operand has lanes, else on doubles."""
     kind = lanes if lanes in kinds else float64
     return kind(*[kind] * len(kinds))
 
 
 def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
-    """Define an operator of Python for lanes."""
+    """Define a Python operator, such as `operator.add`, for operands with lanes."""
 
     def lowered(
         _: BaseContext, builder: ir.IRBuilder, __: Signature, values: Sequence[ir.Value]
@@ -107,10 +108,10 @@ _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Decorate a generator of the code that replaces a function of `kernel.vectors`.
+    """Return a decorator for the generator of the code that replaces a function of `vectors`.
 
-    In place of an array, the function gets the address of the array's first entry, which is a
-    double or a vector.
+    If the first argument of the replaced function is an array, the generator receives the address
+    of the array's first entry instead. This entry is a double or a vector of eight doubles.
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:
@@ -140,7 +141,7 @@ def _operation(
 
 
 def _held(array: Array) -> Type:
-    """Return the type of an array's entries."""
+    """Return the type of an array's entries: lanes if the array has two axes, else doubles."""
     return lanes if array.ndim == 2 else float64
 
 
@@ -203,7 +204,11 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
 
 
 class _NoEnvironments:
-    """numba code generator that sets no environment, because a part has no machine code for it."""
+    """numba code generator for parts, which sets no environment.
+
+    An environment is the run-time data of a numba function. numba would store its address in the
+    function's machine code, but a part has no machine code.
+    """
 
     def __init__(self, codegen: object) -> None:
         self._codegen = codegen
@@ -216,7 +221,7 @@ class _NoEnvironments:
 
 
 class PartLibrary(CPUCodeLibrary):
-    """LLVM code of a part, and the other parts that it calls."""
+    """numba library that contains the LLVM code of a part and refers to the parts that it calls."""
 
     _whole: ir.Module | None = None
 
@@ -241,7 +246,10 @@ class PartLibrary(CPUCodeLibrary):
         return 0
 
     def _called(self, found: dict[CodeLibrary, ir.Module]) -> None:
-        """Add the LLVM code of each function that this part calls, directly or indirectly, once."""
+        """Add to `found` the LLVM code of all functions that this part calls.
+
+        Functions that are called indirectly are included. Each function is added once.
+        """
         for library in self._linking_libraries:
             if library not in found:
                 part = isinstance(library, PartLibrary)
@@ -251,7 +259,7 @@ class PartLibrary(CPUCodeLibrary):
                     library._called(found)
 
     def _get_module_for_linking(self) -> ir.Module:
-        """Return the LLVM code with one copy of each called part."""
+        """Return the LLVM code of this part together with one copy of each part that it calls."""
         if self._whole is None:
             found = {self: super()._get_module_for_linking()}
             self._called(found)
@@ -263,7 +271,7 @@ class PartLibrary(CPUCodeLibrary):
 
 
 class PartCompiler(Compiler):
-    """numba's compiler pipeline for a part."""
+    """numba's compiler pipeline with a `PartLibrary` for the result."""
 
     def __init__(
         self, typing: TypingContext, target: BaseContext, library: CodeLibrary, *rest: object
@@ -274,7 +282,7 @@ class PartCompiler(Compiler):
 
 
 class _StructType(Type):
-    """The numba type of a struct: a pointer to its words."""
+    """numba type of a struct: a pointer to its 64-bit words; see `kernel.tree`."""
 
     def __init__(self, struct: Struct[NamedTuple]) -> None:
         self.struct = struct
@@ -282,7 +290,7 @@ class _StructType(Type):
 
 
 def _numba_type(kind: Kind | Struct[NamedTuple]) -> Type:
-    """Return the numba type of a kind."""
+    """Return the numba type of a field of this kind."""
     if isinstance(kind, Struct):
         return _StructType(kind)
     number = numba.from_dtype(np.dtype(kind.dtype))
@@ -313,7 +321,7 @@ def _field(
 
     def word(place: int) -> ir.Value:
         value = builder.load(at(place))
-        # The words are constant during a call, so LLVM may reuse a value that it has read.
+        # The words are constant during a call, so compiled code may read each word only once.
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
         return value
 
@@ -350,9 +358,10 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
     return extending.intrinsic(opened)
 
 
-# A product and a sum may become one fused instruction, which rounds once. A division by zero gives
-# infinity. Reference counting of arrays is off, because it would take three quarters of the
-# running time. So kernel functions cannot allocate arrays.
+# "contract": a product and a sum may become one fused instruction, which rounds once. "numpy": a
+# division by zero gives infinity or NaN, and no error. "_nrt": reference counting of arrays is off,
+# because it would take three quarters of the running time. So kernel functions cannot allocate
+# arrays.
 _OPTIONS: dict[str, object] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, object] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -375,9 +384,10 @@ class Compiled(Protocol):
 
 @cache
 def translated(function: FunctionType, how: str = "") -> Compiled:
-    """Convert a function of the kernel, and the functions that it calls, to numba functions.
+    """Return a function of the kernel as a numba function that calls only numba functions.
 
-    `how` is "compiled" for a function that Python calls; its machine code is stored on disk.
+    `how` must be "compiled" for a function that Python calls. Its machine code is stored on disk.
+    By default, the function becomes a part.
     """
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:
@@ -390,7 +400,7 @@ def translated(function: FunctionType, how: str = "") -> Compiled:
 
 
 def _counterpart(value: object) -> object:
-    """Return the value that compiled code uses in place of a global of a kernel module."""
+    """Return the value that replaces a global variable of a kernel module in compiled code."""
     if isinstance(value, Struct):
         return opener(value)
     if isinstance(value, ModuleType) and value.__name__.startswith("fflin.kernel."):

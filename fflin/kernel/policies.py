@@ -1,4 +1,4 @@
-"""Policies of the loop: state feedback, output feedback by a filter, and trajectory feedback.
+"""Policies of the loop: linear controllers, grids of state feedback, and trajectory feedback.
 
 All lanes have the same trajectory and the same gains of trajectory feedback.
 """
@@ -24,14 +24,17 @@ class Path(
 ):
     """A trajectory and its gains as piecewise polynomials.
 
-    - `q`, `u`: rows at the knots t (N,) [s]. If the trajectory `ends` before the run, a further row
-      of q, u, nu and K applies at times t > `over` [s].
-    - `shift`: cubics (4, 6 + n) for the displacement from the knot; `speed`: cubics for nu. Their
-      variable is the elapsed fraction of the interval.
-    - u is linear between knots, or constant if `hold` is true. It is evaluated `ahead` [s] after
-      the current time. Each index in `held` is the first of three inputs in world axes.
-    - `K`: polynomials with `order` coefficients in the time since the latest of `starts`. K is
-      constant after `last` [s].
+    - `t` (N,) [s]: the times of the knots. `q`, `u`: one row per knot.
+    - `shift`, `speed`: coefficients (4, 6 + n) of cubic polynomials for each interval between two
+      knots. The cubics of `shift` give the displacement from the interval's first knot. The cubics
+      of `speed` give nu. Their variable is the elapsed fraction of the interval.
+    - `hold`: if true, u is constant between knots, else linear. u is evaluated `ahead` [s] after
+      the current time.
+    - `held`: for each vector of three inputs in world axes, the index of its first input.
+    - `K`: for each time in `starts`, `order` matrices (nu, nx). They are the coefficients of a
+      polynomial in the time since this start. K is constant after `last` [s].
+    - `ends`: whether the trajectory ends before the run. Then q, u, `speed` and K have one further
+      row, which applies at times t > `over` [s].
     - `along` (6 + n,), the error `e` (nx,) and the followed `point` are work space.
     """
 
@@ -54,7 +57,10 @@ def _latest(knots, time):
 
 
 def _placed(knots, time):
-    """Return the index of the interval that contains a time, and its elapsed fraction."""
+    """Return the index of the interval between knots that contains a time, and its elapsed part.
+
+    The elapsed part is a fraction from 0 to 1.
+    """
     last = len(knots) - 2
     k = min(_latest(knots, time), last)
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
@@ -64,7 +70,11 @@ def _placed(knots, time):
 
 
 def error(robot, path, point):
-    """Write the error of a point relative to the followed point, in the axes of the latter."""
+    """Write the error (5.1) of `point` relative to the followed point into `path.e`.
+
+    The position error is in the axes of the followed base. The velocity error is the difference of
+    the two nu, each of which is in the axes of its own base.
+    """
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
@@ -85,8 +95,11 @@ def error(robot, path, point):
 
 
 def track(robot, path, point, u, t):
-    """Write the inputs u* - K e at the time t of the run, with u* in base axes."""
-    # The point of the trajectory at this time.
+    """Write the command u* - K e at the time t of the run; u* are the trajectory's inputs.
+
+    Wrenches in world axes are converted to the axes of the followed base.
+    """
+    # Evaluate the trajectory at this time.
     there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)
     time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
     k, s = _placed(knots, time)
@@ -108,7 +121,7 @@ def track(robot, path, point, u, t):
     for index in range(len(path.held)):
         at = path.held[index]
         vec.put3(there.u, at, vec.across(vec.axes_of(there.q), vec.get3(there.u, at)))
-    # Its error, and the gain at this time.
+    # Compute the error of the robot and evaluate the gain.
     error(robot, path, point)
     starts, width = path.starts, len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
@@ -135,19 +148,21 @@ class Law(
         "kind turned origin near grid filter measured gyros gyro_axes x y added u path allocation",
     )
 ):
-    """A policy; each array of doubles may have a second axis of eight lanes.
+    """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
 
     - `kind`: NOTHING, LINEAR or TRACK. LINEAR computes u from y with `grid` if the grid has joints,
-      and else with `filter`. TRACK computes u = u* - K e along `path`.
-    - `x`: the state, followed by the outputs of the gyroscopes. `gyros` (k,): the body of each
-      gyroscope. `gyro_axes` (9 k,): its axes, as columns in body axes.
-    - `y` (ny,): the entries `measured` of x, plus a row of the noise `added` (slots, ny). Each
-      sample uses the next row, and the rows repeat.
-    - `turned`: whether omega_b and v_b of the state are in reference axes.
-    - `origin` (rows, 7): placement of the world's origin relative to the pose at which q_b and r_b
-      are 0. `near` (rows, n): the angles of continuous joints are unwrapped to be nearest to these
-      positions. Both have one row per sample; after the last sample, the last row applies.
-    - `u`: the command, which `allocation` distributes if it has inputs.
+      and otherwise with `filter`. TRACK computes u = u* - K e along `path`.
+    - `x`: the state (nx,), followed by the three outputs of each gyroscope.
+    - `gyros` (k,): the index of the body that carries each gyroscope. `gyro_axes` (9 k,): the three
+      axes of each gyroscope, in the axes of its body.
+    - `y` (ny,): the outputs, which are the entries `measured` of x plus noise. The noise of each
+      sample is one row of `added` (slots, ny). After the last row, the first row is used again.
+    - `turned` (2,): whether omega_b and v_b of the state are in reference axes.
+    - `origin` (rows, 7): pose of the world frame relative to the pose at which q_b and r_b are 0.
+    - `near` (rows, n): positions for unwrapping. The unwrapped angle of a continuous joint differs
+      from its position in `near` by at most pi.
+    - `origin` and `near` have one row per sample. The last row also applies to all later samples.
+    - `u`: the command. If `allocation` has inputs, the command is distributed to these inputs.
     """
 
 
@@ -162,10 +177,10 @@ class Grid(namedtuple("Grid", "joint first values stride K offset at")):
 class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """Linear controller u = u0 + C z + D dy with dy = y - y0.
 
-    z (nz,) is the controller state, to which `jump` is added before each evaluation. All arrays but
-    `z` and `rates` have one row per sample, as `Law.origin`.
+    z (nz,) is the controller state. Before each evaluation, `jump` is added to z. All arrays except
+    `z` and `rates` have one row per sample, like `Law.origin`.
 
-    - In discrete time, A z + B dy is the next state, and `rates` (nz,) is work space.
+    - In discrete time, A z + B dy is the next z, and `rates` (nz,) is work space.
     - In continuous time, A z + B dy is dz/dt. `rates` (1 + s, nz) stores z at the beginning of the
       step, and then dz/dt at each of the s stages.
     """
@@ -179,7 +194,10 @@ LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocatio
 
 @called
 def read_state(robot, law, point, row):
-    """Write the state of the linear model into `law.x`."""
+    """Write the state of a point into `law.x`.
+
+    `row` is the index of the row of `law.origin` and `law.near` that applies.
+    """
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
     position, turn = vec.get3(law.origin, 7 * row), vec.attitude(law.origin, 7 * row)
     vector, scalar = vec.quaternion_times(turn, vec.attitude(q))
@@ -210,13 +228,17 @@ def _times(matrix, row, x):
 
 
 def command(work, robot, law, point, t, count, stage):
-    """Write the commands of a policy at sample number `count`, for one stage of a step."""
+    """Write the command of a policy into `law.u`.
+
+    t [s] is the time of the run, `count` the index of the sample, and `stage` the index of the
+    stage in the step.
+    """
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
     row = min(count, len(law.origin) // 7 - 1)
     read_state(robot, law, point, row)
-    # The outputs y of the sample, including its noise.
+    # Compute the outputs y, including the noise of this sample.
     outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
     if len(gyros) > 0:
         move_bodies(work, tree, point.nu)
@@ -235,7 +257,7 @@ def command(work, robot, law, point, t, count, stage):
 
 
 def _feed_back_between(robot, law, point):
-    """Write the commands that the interpolated feedback laws of a grid give, lane by lane."""
+    """Write the command of a grid of feedback laws, interpolated separately for each lane."""
     grid, y, u = law.grid, law.y, law.u
     inputs, size = len(u), len(y)
     for axis in range(len(grid.joint)):
@@ -253,7 +275,11 @@ def _feed_back_between(robot, law, point):
 
 
 def _corner(grid, corner, lane):
-    """Return the interpolation weight and the gain index of a corner of a lane's grid cell."""
+    """Return the weight of a grid corner in the interpolation, and the index of its gain in `K`.
+
+    The corner belongs to the grid cell that contains the joint positions of the lane. Bit i of
+    `corner` is 1 at the upper grid value of joint i, and 0 at the lower grid value.
+    """
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
         first, last = grid.first[axis], grid.first[axis + 1] - 1
@@ -270,7 +296,7 @@ def _corner(grid, corner, lane):
 
 @called
 def _filter(by, y, u, row, stage):
-    """Write the commands of a linear law, and its next state or state derivative."""
+    """Write the command of a linear controller `by`, and its next state or state derivative."""
     size, outputs, inputs = len(by.z), len(y), len(u)
     along = len(by.rates) > size
     first = (1 + stage) * size if along else 0

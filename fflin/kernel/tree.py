@@ -1,9 +1,10 @@
 """Arguments of the kernel: named tuples of arrays, such as the kinematic tree of a robot.
 
 numba compiles a function for each set of argument types, and passes a named tuple as separate
-arrays. Here a call has one argument, an array of 64-bit words. A `Struct` is a pointer into the
-array, and its fields are read when they are needed. So the argument types are always the same, and
-a call within compiled code passes one pointer. The words must not change during a call.
+arrays. `kernel.loop` therefore receives its named tuples as one array of 64-bit words. In compiled
+code, a `Struct` is a pointer into this array, and each field is read when it is used. So the
+argument types are always the same, and a call within compiled code passes one pointer. The words
+must not change during a call.
 """
 
 from __future__ import annotations
@@ -26,16 +27,22 @@ from fflin.robot.robot import Robot
 LANES = 8  # number of points that the kernel evaluates with each instruction
 
 
+def address_of(array: NDArray[np.generic]) -> int:
+    """Return the address of the first entry of an array in memory."""
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
 def work_space(size: int) -> Array:
     """Return an uninitialised array (size, LANES)."""
     space = np.empty((size + 1) * LANES)
-    # The kernel's vectors have 64 bytes. Access is faster if they are aligned to 64 bytes.
-    first = -(space.ctypes.data // 8) % LANES
+    # The eight doubles of an entry have 64 bytes. Access is faster if they are aligned to 64 bytes.
+    first = -(address_of(space) // 8) % LANES
     return space[first : first + size * LANES].reshape(size, LANES)
 
 
 class Kind(NamedTuple):
-    """Type of a field: a number (`axes` = 0) or a C-contiguous array with `axes` axes."""
+    """Type of a field: a number if `axes` is 0, else a C-contiguous array with `axes` axes."""
 
     dtype: type[np.generic]
     axes: int = 0
@@ -51,10 +58,11 @@ T = TypeVar("T", bound=NamedTuple)
 
 
 class Struct(Generic[T_co]):
-    """Type of a named tuple of kernel arguments.
+    """Kinds of the fields of a named tuple of kernel arguments.
 
-    `others` maps a field to its kind. `groups` maps a kind to the names of its fields, separated by
-    spaces. All remaining fields are of the kind `rest`.
+    `made` is the class of the named tuple. `others` maps the name of a field to its kind. `groups`
+    maps a kind to the names of the fields of this kind, separated by spaces. All other fields are
+    of the kind `rest`.
     """
 
     def __init__(
@@ -76,13 +84,13 @@ class Struct(Generic[T_co]):
         self.name = f"Struct({made.__name__})"
 
     def __call__(self, words: T) -> T:
-        """Return the named tuple unchanged; in compiled code, interpret words as the struct."""
+        """Return a named tuple unchanged; compiled code interprets an array of words instead."""
         return words
 
 
 @cache
 def empty(kind: Struct[T]) -> T:
-    """Return the value of a struct in which all arrays are empty and all numbers are 0."""
+    """Return a named tuple of this struct with empty arrays and with 0 for each number."""
     parts: list[object] = []
     for of in kind.kinds.values():
         if isinstance(of, Struct):
@@ -95,19 +103,24 @@ def empty(kind: Struct[T]) -> T:
 def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tuple[Array, Array]]]:
     """Convert the fields of a named tuple to the kinds of its struct.
 
-    Return the converted tuple, its words, and a pair for each laned array: the array, and the
-    column of values that fills it. The words contain the addresses of the
-    arrays of the converted tuple, which must therefore exist as long as the words are used.
+    Return the converted tuple, its words, and one pair for each array with lanes. A pair consists
+    of the array and of the column of values with which all its lanes are filled. The words contain
+    the addresses of the converted arrays, so the converted tuple must exist as long as the words
+    are used.
+    """
+    words, fresh = list[int](), list[tuple[Array, Array]]()
+    return _lay_out(value, kind, words, fresh), np.array(words, dtype=np.int64), fresh
+
+
+def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]) -> T:
+    """Return the converted tuple of `laid_out`; append to its lists `words` and `fresh`.
+
+    `words` receives the words of the tuple, `fresh` one pair for each array with lanes.
     """
     parts: list[object] = []
-    words: list[int] = []
-    fresh: list[tuple[Array, Array]] = []
     for part, of in zip(value, kind.kinds.values(), strict=True):
         if isinstance(of, Struct):
-            inner, of_inner, new = laid_out(part, of)
-            parts.append(inner)
-            words += of_inner.tolist()
-            fresh += new
+            parts.append(_lay_out(part, of, words, fresh))
         elif of.axes:
             array = np.ascontiguousarray(part, of.dtype)
             if of == LANED:
@@ -116,20 +129,20 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
                 fresh.append((array, column))
             assert array.ndim == of.axes
             parts.append(array)
-            words += [array.__array_interface__["data"][0], *array.shape]
+            words += (address_of(array), *array.shape)
         else:
             number = of.dtype(part).item()
             parts.append(number)
             words.append(int(np.float64(number).view(np.int64)) if of == REAL else int(number))
-    return value._make(parts), np.array(words, dtype=np.int64), fresh
+    return value._make(parts)
 
 
 # PLACE is the number of entries of a body's pose: x axis, y axis, z axis, and origin relative to
-# the parent's origin. INERTIA is the number of entries of its inertia: m, m c, and I as xx xy xz yy
-# yz zz.
+# the parent's origin. INERTIA is the number of entries of a body's inertia: m, m c, and I as xx xy
+# xz yy yz zz.
 PLACE, INERTIA = 12, 10
-# Number of entries of a body's motion, and number of entries of its subtree's loads; see
-# `kernel.bodies`.
+# MOTION is the number of entries for the motion of a body, and LOAD is the number of entries for
+# the forces and momenta of its subtree. `kernel.bodies` has the offsets of these entries.
 MOTION, LOAD = 30, 27
 
 
@@ -142,42 +155,47 @@ class Tree(
         "bias c columns lower held size",
     )
 ):
-    """Kinematic tree with its loads. Body 0 is the base, which has the coordinates 0 to 5.
+    """Kinematic tree of a robot, with its inputs, stored momenta, springs and dampers.
 
-    Bodies are in Pinocchio's order, coordinates in state order. Fields of each body:
+    Body 0 is the base, which has the coordinates 0 to 5. Every other body has one joint, which
+    connects it to its parent. Bodies are in Pinocchio's order, and coordinates are in the order of
+    nu. In `kernel.loop`, the compiled code has one column per lane for `fixed`, `bodies`, `wrench`,
+    `stored`, `stiffness` and `damping`.
 
-    - `parent`: its parent body.
-    - `fixed` (12): pose of its joint in the parent: the three columns of the rotation, and the
-      origin. z is along the joint axis.
-    - `index`, `unbounded`: the index of its joint in q, and whether q has the cosine of an angle
-      there.
-    - `turns`, `slides`: rotation about z and translation along z per unit of the joint coordinate.
-    - `bodies` (10): m, m c, and inertia about the joint's origin as xx xy xz yy yz zz. It has a
-      second axis of 8 if the inertias of the lanes differ.
-    - `axes`: rotation from the axes of `fixed` to Pinocchio's joint axes.
-    - `coordinate`, `factor`: the coordinate that moves the joint, and the joint's motion per unit
-      of this coordinate.
+    Fields with one value or row per body:
 
-    `armature` is the inertia of rotors on the diagonal of M. Fields of the packed M:
+    - `parent`: index of the parent body.
+    - `fixed` (12): pose of the joint frame relative to the parent's joint frame, for the joint
+      position zero: the three columns of the rotation, then the origin. z is along the joint axis.
+    - `index`: index of the joint position in q. `unbounded`: whether q holds the cosine and sine of
+      the joint angle instead.
+    - `turns`, `slides`: rotation about z and translation along z per unit of the joint position.
+    - `bodies` (10): m, m c, and the inertia about the joint's origin as xx xy xz yy yz zz.
+    - `axes` (3, 3): rotation from the joint frame to Pinocchio's joint frame.
+    - `coordinate`: the coordinate that moves the joint. `factor`: the joint motion per unit of this
+      coordinate.
 
-    - `row`, `depth`: offset of each row, and the number of its entries before the diagonal.
-    - `path`: the coordinate of each entry.
-    - `common`: the number of coordinates that two rows have in common.
-    - `target`, `share`: one value for each pair of a body and a body on its path to the base.
-      `target` is the entry of M to which the pair contributes, `share` the factor of the
-      contribution. After the pairs of a body, `target` holds the first of the six entries that
-      couple the body to the base.
+    Fields for M, whose rows are packed as in `kernel.bodies`:
 
-    Fields of the loads:
+    - `armature` (6 + n,): the inertia of rotors, which is added to the diagonal of M.
+    - `row`, `depth` (6 + n,): the offset of each row, and the number of its entries before the
+      diagonal.
+    - `path`: the column of each entry.
+    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that both contain.
+    - `target`, `share`: one value for each pair of a body and a body on its path to the base,
+      including the body itself. `target` is the entry of M to which the pair contributes, and
+      `share` is the factor of this contribution. After the pairs of a body, one further value
+      refers to the six entries that couple its coordinate to the base: `target` is the first entry.
+
+    Fields for the forces:
 
     - `driven`: the coordinate that each input drives, -1 for a body-fixed wrench.
     - `wrench_body`, `wrench`, `input`: for each body-fixed input, its body, its unit wrench at the
-      body's joint, and its index.
-    - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta.
-    - `stiffness`, `damping`: the springs and dampers of the joints.
+      body's joint, and its index among all inputs.
+    - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta in joint axes.
+    - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
-    The other fields are offsets of the parts of the work space, and `size` is the size of the work
-    space.
+    The other fields are offsets in the work space, except `size`, the size of the work space.
     """
 
 
@@ -193,7 +211,11 @@ TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON
 
 @lru_cache(maxsize=16)  # robots do not change
 def batch_tree(robot: Robot) -> Tree | None:
-    """Return a robot's tree; None in orbit, or if a joint is not a screw about a constant axis."""
+    """Return the tree of a robot.
+
+    Return None in orbit, or if a joint is not a screw joint. A screw joint is revolute, prismatic
+    or helical, with a constant axis.
+    """
     if robot.orbit:
         return None
     model = robot.model
@@ -212,7 +234,8 @@ def batch_tree(robot: Robot) -> Tree | None:
         dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
         inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
     state, size = StateMap(robot), 6 + robot.n
-    # A row of S, with v = S nu, has one nonzero entry: a joint's motion per unit of its coordinate.
+    # In v = S nu, the row of a joint has one nonzero entry: the joint motion per unit of the
+    # coordinate that moves the joint.
     S, of_v = state.spread(np.eye(size)).T, [joint.idx_v for joint in joints]
     coordinate = np.abs(S).argmax(axis=1)[of_v].tolist()
     factor = S[of_v, coordinate].tolist()
@@ -229,7 +252,7 @@ def batch_tree(robot: Robot) -> Tree | None:
             above = parent[above]
         target.append(row[coordinate[body]])
         share.append(factor[body])
-    # For each two coordinates, the number of coordinates that their paths have in common.
+    # For each pair of paths, count the coordinates that both paths contain.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
     wrench_body: list[int] = []
@@ -275,9 +298,10 @@ def batch_tree(robot: Robot) -> Tree | None:
 
 
 def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, float] | None:
-    """Return a frame with z along a joint's axis, the joint's rotation and translation per unit.
+    """Return a frame with z along a joint's axis, and the joint's rotation and translation.
 
-    Return None if the joint is not a screw about a constant axis.
+    Rotation about z and translation along z are per unit of the joint position. Return None if the
+    joint is not a screw joint; see `batch_tree`.
     """
     data = joint.createData()
     q, v = pin.neutral(model), np.zeros(model.nv)
@@ -299,7 +323,7 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return the column indices of each row of the factor; the last one is the diagonal."""
+    """Return the columns of the entries of each row of L (M = L^T D L), the diagonal last."""
     # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
     # branches. Fill-in during the factorisation joins the coordinates of these ancestors to one
     # path (Liu's elimination tree).
@@ -317,7 +341,7 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
         if reached[index]:
             nearest = max(reached[index])
             reached[nearest] |= reached[index] - {nearest}
-    # A row of the inverse factor has entries along the whole path inwards.
+    # Each row stores the whole path to the base, because the rows of L^-1 are full along this path.
     for index in range(size):
         paths[index] = [*(paths[max(reached[index])] if reached[index] else ()), index]
     return paths

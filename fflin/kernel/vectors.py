@@ -1,13 +1,14 @@
 """Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
 
-A function of the kernel is a Python function. The Python engine calls it directly, with arrays or
-lists of one axis. It then computes one number at a time, and a debugger can step through it.
-`kernel.machine_code` compiles the same function, also for arrays with a second axis of eight lanes.
-In compiled code, other operations of `kernel.machine_code` replace the operations below.
+All functions of the kernel are written in Python. The Python engine calls some of them directly,
+with arrays or lists that have one axis. A function then computes one number at a time, and a
+debugger can step through it. `kernel.machine_code` compiles the same functions, also for arrays
+with a second axis of eight lanes. In compiled code, other operations replace `load`, `store`,
+`chosen`, `below`, `floor`, `whole`, `root` and `angle`.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
-displacement has the order of the state: the base's rotation and translation in base axes, then the
-joints.
+displacement has the order of the state: first the base's rotation and translation in base axes,
+then the displacements of the joints.
 """
 
 from __future__ import annotations
@@ -26,23 +27,25 @@ F = TypeVar("F", bound=Callable[..., object])
 
 # One number; in compiled code, one number or eight lanes.
 Number: TypeAlias = float
-# Numbers in memory. The entries of a list are read faster than the entries of an array.
+# Numbers in memory. Lists are allowed, because Python reads an entry of a list faster than an entry
+# of an array.
 Entries: TypeAlias = Array | list[Number]
 
-# Functions of the kernel that are called. All other functions are inlined in their callers.
+# Functions of the kernel that numba does not inline. All other functions are inlined in their
+# callers.
 CALLED: set[Callable[..., object]] = set()
 # {function: function or operation that compiled code uses in its place}.
 IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Mark a rarely called function: it is not inlined, which saves compilation time."""
+    """Mark a rarely called function, which numba must not inline; this saves compilation time."""
     CALLED.add(function)
     return function
 
 
 def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
-    """Decorate a function that uses NumPy; compiled code calls a loop in its place."""
+    """Return a decorator for a NumPy function, for which compiled code substitutes `loop`."""
 
     def noted(function: F) -> F:
         IN_PLACE[function] = called(loop)
@@ -70,18 +73,18 @@ def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
 
 
 def below(value: Number, bound: Number) -> bool:
-    """Return whether a number, or every lane, is less than a bound; false for NaN."""
+    """Return whether a number is less than a bound, in all lanes; false if a number is NaN."""
     return value < bound
 
 
 def peek(array: Array, index: int, lane: int) -> float:
-    """Return the value of a lane at an index."""
+    """Return the entry of one lane at an index."""
     value: float = array[index] if array.ndim == 1 else array[index, lane]
     return value
 
 
 def poke(array: Array, index: int, lane: int, value: float) -> None:
-    """Write the value of a lane at an index."""
+    """Write the entry of one lane at an index."""
     if array.ndim == 1:
         array[index] = value
     else:
@@ -207,10 +210,10 @@ def times6(s, value):
 
 
 def cosine_and_sine(x):
-    """Return the cosine and sine of |x| < 1e6, accurate to one unit in the last place.
+    """Return the cosine and sine of x, accurate to one unit in the last place for |x| < 1e6.
 
-    Three subtractions reduce x to |x| <= pi/4, where polynomials are evaluated. All coefficients
-    are from fdlibm (Sun Microsystems, 1993).
+    A multiple of pi/2 is subtracted from x in three parts, so that |x| <= pi/4. There, the cosine
+    and the sine are polynomials. All coefficients are from fdlibm (Sun Microsystems, 1993).
     """
     turns = floor(x * (2.0 / np.pi) + 0.5)
     x = x - turns * 1.57079632673412561417e00
@@ -229,7 +232,8 @@ def cosine_and_sine(x):
     p = -1.38888888888741095749e-03 + z * p
     p = 4.16666666666666019037e-02 + z * p
     cosine = (1.0 - 0.5 * z) + z * z * p
-    # Rotate by the removed quarter turns: (cosine, sine) = (1, 0), (0, 1), (-1, 0) or (0, -1).
+    # Rotate back by the subtracted multiple of pi/2. The cosine `even` and the sine `odd` of this
+    # multiple are (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * 0.5)
     odd = turns - half - half
     sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
@@ -283,12 +287,12 @@ def attitude(q, at=0):
 
 
 def axes_of(q):
-    """Return the base's axes in the world."""
+    """Return the base's three axes in world coordinates, the columns of its rotation matrix."""
     return columns_of(attitude(q))
 
 
 def displace(tree, q, along, out):
-    """Write q displaced along a tangent vector; the base moves by the exponential map."""
+    """Write q, displaced by the tangent vector `along`; the base moves by the exponential map."""
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square

@@ -48,29 +48,28 @@ _ULPS = 8.0
 # Assumed rounding error [ulp] of a finite difference of accelerations.
 _STEP_ULPS = 64.0
 
-# Tolerances for the comparison with ABA derivatives, relative to the largest entry of a block. The
-# first applies to a well-conditioned M. The second is multiplied by the condition number of M; the
-# larger result applies.
+# The relative tolerance for the comparison with ABA derivatives is the larger of two values: the
+# first number, and the second number times the condition number of M.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# The same two tolerances for sixth-order finite differences. They are larger, because division by
-# the small step amplifies rounding errors.
+# The same two numbers for sixth-order finite differences. They are larger, because the division by
+# a small step amplifies rounding errors.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
-# Largest expected error of ABA's derivatives, as a multiple of the residual of ABA's M^-1.
+# Largest expected ratio of the error of ABA's derivatives to the residual of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
 # Upper bound of all tolerances, even for an ill-conditioned M. A larger tolerance would confirm
 # fewer than two digits.
 _LOOSEST = 1e-2
 
-# Large terms that cancel in exact arithmetic leave rounding errors of about 1e-16 of their size.
-# Errors are therefore relative to a scale that includes this fraction of such terms. The fraction
-# is so small that the scale does not hide larger errors.
+# The terms with the base's linear velocity cancel in exact arithmetic. Numerically, they leave
+# rounding errors of about 1e-16 of their size. Errors are therefore divided by a scale that
+# includes the following fraction of these terms. A larger fraction would hide other errors.
 _ROUNDING_FRACTION = 1e-3
 
 
-# Base speed [m/s] whose rounding errors would hide the other velocities. A faster base is described
-# relative to an observer that moves with it.
+# If the base is faster than this speed [m/s], its velocity is measured relative to an observer that
+# moves with it. Otherwise, the rounding errors of this velocity would hide the other velocities.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -186,7 +185,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 def check_all(
     robot: Robot, models: Iterable[LinearModel], title: str = "", *, tolerance: float | None = None
 ) -> Check:
-    """Check models; of each comparison, keep the row with the largest error / tolerance."""
+    """Check models, and keep one row per comparison: the row with the largest error / tolerance."""
     if tolerance is not None:
         tolerance = share("tolerance", tolerance)
     worst: dict[tuple[str, str], Row] = {}
@@ -216,26 +215,28 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    # If links are far apart, ABA is less accurate than M. The error of ABA's derivatives is
-    # estimated from the error of its M^-1, which is the residual of M M^-1 = I.
+    # If links are far apart, ABA is less accurate than the composite-rigid-body algorithm, which
+    # computes M. So the error of ABA's derivatives is estimated from the residual M M^-1 - I, where
+    # ABA computes M^-1.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     yield "ABA derivatives", scales.errors(A, B), by_aba
 
     model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
-    # The accelerations of light, aligned links change over small rotations. The step of a finite
-    # difference is smaller than these rotations.
+    # If light links are aligned, even a small rotation of a joint changes the accelerations
+    # strongly. The steps of the finite differences must be smaller than such a rotation.
     steps = np.full(nx + len(lin.u0), 2e-4)
-    # Keep the points well inside the chart, because f becomes steep near its limit |q_b| = 1.
+    # Keep the points well inside the chart, because f is steep near the chart's limit |q_b| = 1.
     steps[g.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
-    # f is quadratic in the velocities and linear in the inputs, so these steps can be large without
-    # a truncation error.
+    # f is quadratic in the velocities and linear in the inputs. So central differences with large
+    # steps have no truncation error.
     speed = np.abs(lin.x0[-nv:])
     steps[nv:nx] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
     steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
     steps[nx:] = max(1.0, _largest(lin.f0[-nv:] / scales.mobility)) / scales.input_mobility
-    # f is at most quadratic in every variable except the attitude and the joint positions.
+    # Only the attitude and the joint positions need sixth-order differences, because f is at most
+    # quadratic in every other variable.
     bends = np.zeros(len(point), dtype=bool)
     bends[g.q_b] = bends[g.q_m] = True
     slopes = jacobian(model.rates, point, steps, bends)
@@ -266,7 +267,10 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
 def _output_errors(
     model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float
 ) -> dict[str, float]:
-    """Return the errors of C, D and y0, compared with differences of the nonlinear outputs."""
+    """Return the errors of y0, C and D.
+
+    y0 is compared with the nonlinear outputs, C and D with finite differences of these outputs.
+    """
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
         of_C = _largest(lin.C - np.eye(nx))
@@ -279,7 +283,9 @@ def _output_errors(
 
     here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
     errors = {"y0": _largest(lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-    # A derivative is only noise if it is smaller than the rounding error of y / step.
+    # Divide the errors of a row by the row's largest derivative, or by `noise` if this is larger.
+    # `noise` is the rounding error of y / step, divided by the tolerance. So a rounding error alone
+    # does not exceed the tolerance.
     noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
     for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
         largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
@@ -288,7 +294,7 @@ def _output_errors(
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
-    """Return the certificate of a continuous-time model: its errors compared with ABA."""
+    """Return the certificate of a continuous-time model; A and B are compared with ABA."""
     aba = Aba(StateMap(robot, reference=lin.reference, frame=lin.frame))
     A, B, _ = aba_route(aba, lin.q, lin.v, lin.u0, moving=lin.moving)
     errors = Scales(aba, lin, lin.M, B).errors(A, B)
@@ -308,7 +314,7 @@ def scaled_condition(M: Array) -> float:
 
 
 def inertia_residual(M: Array, inverse: Array) -> float:
-    """Return the largest entry of ``M M^-1 - I`` with M scaled to a unit diagonal."""
+    """Return the largest magnitude in ``M M^-1 - I``, with M scaled to a unit diagonal."""
     scale = np.sqrt(M.diagonal())
     residual = M @ inverse - np.eye(len(M))
     return float(np.abs(residual * scale / scale[:, None]).max())
@@ -338,19 +344,20 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
 def aba_route(
     aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return A and B, computed from ABA's derivatives by (4.9) and (15.3), and ABA's M^-1."""
+    """Return A and B from ABA's derivatives by (4.9), (15.3) and (15.4), and also ABA's M^-1."""
     state = aba.state
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates about the world's origin, so a distant base would reduce the
-    # accuracy. Place the base at the origin, because no derivative depends on its position, even in
-    # orbit.
+    # accuracy. Place the base at the origin. This is allowed, because no derivative depends on the
+    # position of the base, even in orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     (rates,) = state.velocities(aba.accelerations(at_origin[None], v[None], u[None]))
     there = own.jacobians(q, nu, u, rates)
-    # Upper half of A: kinematics of a small displacement, in axes that rotate with the base.
+    # Assemble A_y and B_y of (4.9). The upper half of A_y is the kinematics of a small displacement
+    # in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
@@ -363,16 +370,18 @@ def aba_route(
 class Scales:
     """Magnitudes of the terms of a model, by which the errors of A and B are divided.
 
-    M (6 + n, 6 + n) and B (nx, nu) are computed independently, not taken from the model.
+    The arguments M (6 + n, 6 + n) and B (nx, nu) come from an independent computation, not from
+    the model.
     """
 
     def __init__(self, aba: Aba, lin: LinearModel, M: Array, B: Array) -> None:
         self._state = state = aba.state
         self._inputs, self._lin, self._nv = aba.actuation.groups, lin, len(M)
-        # In orbit, terms with the inertial velocity cancel, so their size depends on this velocity.
+        # In orbit, the terms that cancel contain the inertial velocity, not the velocity relative
+        # to the orbital frame.
         self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
-        # Mobilities: sqrt((M^-1)_ii) (6 + n,) of each coordinate, and sqrt(b^T M^-1 b) (nu,) of
-        # each input, where b is the generalised force per unit of the input.
+        # The mobility of coordinate i is sqrt((M^-1)_ii). The mobility of an input is
+        # sqrt(b^T M^-1 b), where b is the generalised force of a unit input.
         self.mobility = np.sqrt(np.linalg.inv(M).diagonal())
         lower = B[-self._nv :]
         inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
@@ -382,15 +391,17 @@ class Scales:
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
     ) -> dict[str, float]:
-        """Compare the model with other A and B; return errors of blocks such as "A[q_b, q_m]".
+        """Compare the model with other A and B; return the error of each block "A[q_b, q_m]" etc.
 
-        If A and B were computed by finite differences, `steps` (nx,) are their steps, and
-        `rounding` is their rounding error relative to the tolerance.
+        If A and B were computed by finite differences, `steps` (nx,) are the steps of the
+        differences. `rounding` is then the rounding error of the differences, divided by the
+        tolerance.
         """
-        # Errors are relative to the largest entry of a block. Rows of accelerations are divided by
-        # the mobility of their coordinate, so that a light joint does not hide the error of a heavy
-        # joint. Columns of B are divided by the mobility of their input. If large terms cancel in a
-        # block of A, errors are relative to these terms, because their rounding errors remain.
+        # Divide rows of accelerations by the mobility of their coordinate, so that a light joint
+        # does not hide the error of a heavy joint. Also divide the columns of B by the mobility of
+        # their input. The errors of a block of A are then relative to its largest entry. If larger
+        # terms cancel in this block, the errors are relative to the size of these terms, because
+        # their rounding errors do not cancel.
         state, lin, nv = self._state, self._lin, self._nv
         terms = self._terms
         if steps is not None:
@@ -409,9 +420,12 @@ class Scales:
         return errors
 
     def _sizes(self, v: Array) -> tuple[Array, float]:
-        """Return the sizes (6, 6) of cancelling terms in each block of the scaled A, and in f0."""
-        # The base's linear velocity counts only as the fraction _ROUNDING_FRACTION, because it
-        # causes nothing but rounding errors in Pinocchio's derivatives.
+        """Return the sizes of terms that cancel: (6, 6) for the blocks of A, and one for f0.
+
+        Rows of accelerations are divided by the mobility of their coordinate.
+        """
+        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because in Pinocchio's
+        # derivatives it causes only rounding errors.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -421,8 +435,8 @@ class Scales:
         for _, stored in robot.stored_momentum:
             momentum += float(np.linalg.norm(stored))
         rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
-        # Gyroscopic torque of the wheels per unit rate of their link, in the units of the scaled
-        # rows.
+        # Gyroscopic torque of the wheels per unit angular velocity of their link, multiplied by the
+        # largest mobility, as in the scaled rows of accelerations.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
         slowed = speed.copy()
         slowed[LINEAR] *= _ROUNDING_FRACTION
@@ -432,8 +446,9 @@ class Scales:
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
-        # Derivatives of the velocity-dependent accelerations over the velocities, at the present
-        # rates. For angular velocities, they also contain the present linear velocity of the base.
+        # Sizes of the derivatives of the velocity-dependent accelerations over omega_b, v_b and the
+        # joint velocities, at the velocity v. The derivatives over omega_b and the joint velocities
+        # also contain the linear velocity of the base.
         turning = rate * np.array([*map(_largest, np.split(unit, (3, 6)))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
@@ -454,14 +469,17 @@ class Nonlinear:
         observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         moves = np.linalg.norm(observer) > _FAST and aba.field is None
         self._observer = observer if moves else np.zeros(3)
-        # Velocity and acceleration of the reference.
+        # Velocity and acceleration of a moving reference; zero for a fixed one.
         self._v: Array = np.zeros((1, aba.state.robot.nv))
         self._a: Array = np.zeros_like(self._v)
         if lin.moving:
             _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
 
     def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
-        """Return the charts, q, v and dv/dt (Pinocchio's order) for rows (x, u) (N, nx + nu)."""
+        """Return the charts, q, v and dv/dt for rows (N, nx + nu) of states and inputs.
+
+        q, v and dv/dt are in Pinocchio's order.
+        """
         x, u = np.split(point, [self.state.nx], axis=1)
         chart, q, v = self.state.points(x)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
@@ -472,10 +490,11 @@ class Nonlinear:
         return chart, q, v, a
 
     def rates(self, point: Array) -> Array:
-        """Return dx/dt (N, nx) for rows (x, u) (N, nx + nu)."""
+        """Return dx/dt (N, nx) for rows (N, nx + nu) of states and inputs."""
         state, (chart, _, v, a) = self.state, self.accelerations(point)
-        # Rates of the error relative to a reference with velocities v* and w*: edot = (e0 (w - w*)
-        # + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
+        # The error (5.1) relative to a reference with velocities v* and w* has the derivatives
+        # de/dt = (e0 (w - w*) + e x (w + w*)) / 2 and dr/dt = R_e v - v* - w* x r. Here (e, e0) is
+        # the error quaternion, and R_e is its rotation matrix.
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)
@@ -484,20 +503,21 @@ class Nonlinear:
         position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
-            # Components of v in reference axes have another derivative than components in base
-            # axes. Add the difference w x v.
+            # `rate` contains the derivative of the components of v in base axes. Add w x v, so that
+            # it becomes the derivative of v relative to the reference.
             rate[:, LINEAR] += np.cross(angular, linear)
         rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
         joint_rates = state.velocities(v - self._v)[:, 6:]
         return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
 
     def flow_error(self) -> float:
-        """Return the relative error of f, compared with finite differences along short motions."""
+        """Return the relative error of f, compared with differences of x along short motions."""
         lin, robot = self._lin, self.state.robot
         reference = pin.SE3(lin.reference.rotation, np.zeros(3))
         state = StateMap(robot, reference=reference, frame=lin.frame)
         near = Nonlinear(self._aba, lin, state)
-        # The first row is the point itself. In each other row, one base velocity is increased by 1.
+        # The first row is the operating point. In each other row, one component of the base
+        # velocity is increased by 1.
         x = np.tile(lin.x0, (7, 1))
         x[:, state.groups.r_b] = 0.0
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
@@ -517,10 +537,10 @@ class Nonlinear:
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
-    """Compute the Jacobian of f by central differences; f maps rows of points to rows of values.
+    """Return the Jacobian of f at a point, computed by central differences with the given steps.
 
-    Columns in the mask `is_curved` use sixth-order differences. All others use second-order
-    differences.
+    f maps rows of points to rows of values. The mask `is_curved` selects the variables for which
+    sixth-order differences are used. For all other variables, differences of second order are used.
     """
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))

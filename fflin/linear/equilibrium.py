@@ -19,8 +19,8 @@ from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Rounding error of M a, of accelerations and of principal moments of inertia. It is relative to the
-# terms that are summed.
+# Assumed rounding error of M a, of accelerations and of principal moments of inertia, relative to
+# the magnitudes of the terms in their sums.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -208,7 +208,7 @@ def equilibrium(
 
 
 class _Balance:
-    """Balance of forces at a point: minimum-norm inputs, in base axes, and residual forces."""
+    """Minimum-norm inputs, in base axes, to balance the forces at a point, and residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -219,7 +219,8 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        # Bounds (6 + n,) of the rounding errors that remain in the forces if large terms cancel.
+        # Compute bounds (6 + n,) of the rounding errors in the forces, in which large terms may
+        # cancel.
         state, springs = linearizer.prepared.map, robot.springs
         absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         speed = np.abs(state.velocities(absolute))
@@ -237,7 +238,12 @@ class _Balance:
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
-    """Raise `EquilibriumError` if a joint moves and the forces depend on its position."""
+    """Raise `EquilibriumError` if the motion of a joint or of the base changes the forces.
+
+    `drift` (nx,) is the state derivative. Three motions raise the error: a joint that is not a
+    rotor moves, the base moves in an orbital frame, or under gravity, the base rotates about an
+    axis that is not vertical.
+    """
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
         for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
@@ -264,12 +270,16 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest allowed residual, as a fraction of the forces to be balanced.
+# Largest allowed residual, as a fraction of the forces to be balanced. Also the largest velocity of
+# the base that counts as zero.
 TOLERANCE = 1e-9
 
 
 def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Array, Array]:
-    """Minimise ``|C u - d|`` for ``u[one_sided] >= 0``; return u of least norm and ``C u - d``."""
+    """Return the minimum-norm u that minimises ``|C u - d|``, and the residual ``C u - d``.
+
+    The constraint is ``u[one_sided] >= 0``.
+    """
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         from fflin.kernel.allocation import nearest
@@ -277,8 +287,8 @@ def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Arra
         least, most = np.full((2, len(u)), [[-np.inf], [np.inf]])
         least[one_sided] = 0.0
         bounded = nearest(C, d, least, most)
-        # Solve again without bounds, with only the two-sided and the nonzero one-sided inputs. This
-        # removes the rounding errors of the bounded solution.
+        # Solve again without bounds, and without the one-sided inputs that are zero. The second
+        # solution has smaller rounding errors than the bounded solution.
         pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
         u = np.zeros(len(u))
         u[pushing] = _pseudo_solve(C[:, pushing], d)
@@ -445,7 +455,8 @@ def relative_equilibria(
         pitch = 3.0 * (along - radial) / normal
         k_a, k_r = (normal - radial) / along, (normal - along) / radial
         b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
-        # Solve mu^2 + b mu + c = 0 for mu = lambda^2 / n^2 without cancellation.
+        # Solve the equation (14.8) of roll and yaw, mu^2 + b mu + c = 0 with mu = lambda^2 / n^2.
+        # This form of the solution avoids cancellation.
         apart = np.sqrt(complex(b * b - 4.0 * c))
         larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
         squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)

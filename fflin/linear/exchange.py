@@ -183,12 +183,13 @@ class ToolGain(Design):
 
 
 def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
-    """Convert a gain K of a model to a tool's coordinates, with the same closed-loop poles."""
+    """Convert the gain K of a model to a tool's coordinates, with the same closed-loop poles."""
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # The axes of the tool rotate relative to the axes of the model, so a constant input of the
-    # model varies with the attitude in the tool (15.4).
+    # The input axes of the tool may rotate relative to the input axes of the model. An input that
+    # is constant in the axes of the model then varies with the attitude in the axes of the tool
+    # (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
 
@@ -282,7 +283,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, both Jacobians (of the model, of the tool), and dy/dt."""
+    """Return a tool's coordinates, the Jacobians of the model and of the tool, and dy/dt (15.1)."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -297,14 +298,17 @@ def _jacobians_at(
 
 
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
-    """Transform A and B from the coordinates `source` to the coordinates `to` (15.3), (15.4)."""
+    """Transform A and B by (15.3) to (15.5).
+
+    `source` has the Jacobians of the present coordinates, `to` of the new coordinates.
+    """
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
 def _step(tool: str, dt: float | None) -> float:
-    """Return the checked time step, or 0 if dt is None."""
+    """Return the time step dt of a tool after checking it, or 0 if dt is None."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(
@@ -314,7 +318,10 @@ def _step(tool: str, dt: float | None) -> float:
 
 
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a semi-implicit Euler step (15.6); linear rows precede angular rows."""
+    """Return A, B and f0 of a semi-implicit Euler step of h [s] (15.6).
+
+    `rate` is dy/dt. For the base, linear rows precede angular rows.
+    """
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)

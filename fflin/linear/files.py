@@ -1,10 +1,11 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
 A model in csv consists of several tables. They are for other programs; fflin does not read them.
-There is one table for each matrix, with the names of its rows and columns. There is one table each
-for the states, inputs and outputs, and the table ``info`` for all other entries. A trajectory in
-csv is one table. Its last column contains the digest of the other columns, repeated in every row.
-The file therefore has no extra lines, and other programs can read it by column names.
+Each matrix has a table with the names of its rows and columns. The states, the inputs and the
+outputs have a table each. The table ``info`` contains all other entries.
+
+A trajectory in csv is one table. Its last column contains the digest of the other columns in every
+row. The digest therefore needs no extra line, which other programs could not read.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ T = TypeVar("T")
 
 
 def record_of(lin: LinearModel) -> Record:
-    """Return the entries of a file for a model."""
+    """Return the entries of a model's file as {name: value}."""
     entries: Record = {
         "reference": lin.placement,
         "drift": np.zeros(0) if lin.drift is None else lin.drift,
@@ -83,7 +84,10 @@ def record_of(lin: LinearModel) -> Record:
 
 
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
-    """Write the entries of a model, and their digest if `checksummed`; see `LinearModel.save`."""
+    """Write the entries of a model to a file; see `LinearModel.save`.
+
+    If `checksummed`, the file also contains their digest, except in csv.
+    """
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
         record.write_record(path, entries, checksummed=checksummed)
@@ -109,7 +113,7 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
-    """Return the fields of a model, and its certificate; see `LinearModel.load`."""
+    """Read the fields of a model and its certificate from a file; see `LinearModel.load`."""
     with reading(path, "linear model"):
         entries, verified = read_record(path)
         fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
@@ -151,7 +155,10 @@ def given(value: T, _: object) -> T:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that saving NAME.csv would overwrite and that contains no model, or None."""
+    """Return a file that is not part of a model, but would be overwritten by saving NAME.csv.
+
+    Return None if there is no such file.
+    """
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
@@ -164,7 +171,7 @@ def _csv_path(path: Path, key: str) -> Path:
 
 
 def write_csv(path: Path, traj: Trajectory) -> None:
-    """Write a trajectory as named columns, which `Trajectory.load` reads."""
+    """Write a trajectory as a csv table with named columns, for `Trajectory.load`."""
     columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
     names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
@@ -177,7 +184,7 @@ def write_csv(path: Path, traj: Trajectory) -> None:
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
-    """Return names with units, such as ``t [s]``; dimensionless names have no unit."""
+    """Return names with units, such as ``t [s]``; a dimensionless signal gets no unit."""
     pairs = zip(names, units, strict=True)
     return [name if unit in ("", "1") else f"{name} [{unit}]" for name, unit in pairs]
 
@@ -205,7 +212,10 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
 def arguments(
     entries: Record, robot: Robot, hold: str | None, frame: str, verified: bool
 ) -> dict[str, Any]:
-    """Return the arguments of `Trajectory` from the entries t and u, and either q and v, or x."""
+    """Return the arguments of `Trajectory` from the entries of a file.
+
+    The file must contain t, u, and either x or both q and v.
+    """
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
         found = ", ".join(sorted(entries))
@@ -227,7 +237,7 @@ def arguments(
             "(--inputs)"
         )
     for columns in actuation.held:
-        # Inputs in reference axes are rotated to world axes.
+        # Rotate base torques and forces from reference axes to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
     found_as: dict[str, object] = {"t": np.ravel(entries["t"]), "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}

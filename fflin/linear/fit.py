@@ -1,4 +1,4 @@
-"""Checks that a model or design fits a robot: its names and units must be equal."""
+"""Checks that a model or design fits a robot: the signals must have the same names and units."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ def about_point(lin: object) -> LinearModel:
 def require_fit(
     lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False, sensed: bool = False
 ) -> None:
-    """Raise `InputError` if a model's states or inputs, or outputs (`sensed`), are not the robot's.
+    """Raise `InputError` if a model does not have the states and inputs of the robot.
 
-    A reduced model, which lacks states of the robot, is accepted unless `whole` is True.
+    If `sensed` is True, the outputs must be the same too. A reduced model, which lacks some states
+    of the robot, is accepted unless `whole` is True.
     """
     made = f"the model was made for '{lin.robot}'"
     require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)
@@ -63,12 +64,13 @@ def signals_of(state: StateMap, kind: str) -> Signals:
 def require_same(
     made: str, state: StateMap, kind: str, names: Names, units: Names | None, *, part: bool = False
 ) -> None:
-    """Raise `InputError` if names or units differ from the robot's; the message lists them.
+    """Raise `InputError` if the robot's signals do not have the given names and units.
 
-    Units are not compared if they are None. With `part`, the robot may have more signals.
+    `made` is the beginning of the message, such as "the model was made for 'arm'". If `units` is
+    None, only names are compared. If `part` is True, the robot may have further signals.
     """
     robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
-    if part:
+    if part and names != tuple(others):
         others = {name: others[name] for name in names if name in others}
     if names == tuple(others) and units in (None, tuple(others.values())):
         return
@@ -90,7 +92,10 @@ def require_same(
 
 
 def require_turns(made: str, size: int, robot: Robot) -> None:
-    """Raise `InputError` if a configuration of `size` entries does not fit the robot."""
+    """Raise `InputError` if a configuration of the robot does not have `size` entries.
+
+    The size differs if other joints are continuous.
+    """
     if size != robot.nq:
         raise InputError(
             f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "

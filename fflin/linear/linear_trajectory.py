@@ -87,7 +87,7 @@ class LinearTrajectory(Trajectory):
         return len(self.A)
 
     def __getitem__(self, index: int) -> LinearModel:
-        """Return the linear model at a knot."""
+        """Return the linear model at the knot with this index."""
         k = range(len(self))[index]
         lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         own = {name: getattr(self, name)[k] for name in "ABCD"}
@@ -235,7 +235,7 @@ def linearize_trajectory(
 
 
 def along(motion: Trajectory) -> LinearTrajectory:
-    """Linearise about all knots of a trajectory."""
+    """Return the error dynamics of a trajectory, linearised about all knots."""
     linearizer = Linearizer(motion.robot, moving=True)
     found: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
     for key in ("state_names", "input_names", "output_names"):
@@ -247,8 +247,8 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# Steps are halved until the transition matrix of a sample has the accuracy _ACCURACY, or until an
-# interval between knots has _MOST_PARTS parts.
+# Relative accuracy of a sample's transition matrix. The integration steps are halved until it is
+# reached, or until each interval between knots has _MOST_PARTS parts.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
@@ -265,7 +265,11 @@ class Steps(NamedTuple):
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
-    """Yield the steps and the transition matrix (nx, nx + nu) of each sample."""
+    """Yield the integration steps and the transition matrix of each sample of dt [s].
+
+    The transition matrix (nx, nx + nu) maps the error and the input at the start of the sample to
+    the error at its end.
+    """
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
         duration = traj.t[-1] - traj.t[0]
@@ -286,8 +290,8 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
             finer = _through(traj, [batch[k] for k in coarse], parts)
             pending = []
             for k, each in zip(coarse, finer, strict=True):
-                # Halving the steps divides the error by 16. The estimate assumes only a factor of
-                # 4, as a safety margin.
+                # Halving the steps divides the error by 16. For a safety margin, the estimate
+                # assumes that it divides the error by 4.
                 apart = np.abs(each[1] - found[k][1]).max(axis=0)
                 if not (0.25 * apart <= _ACCURACY * np.abs(each[1]).max(axis=0)).all():
                     pending.append(k)
@@ -296,10 +300,11 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
-    """Return the steps and the transition matrix of each sample.
+    """Return the steps and the transition matrix of each sample; see `transitions`.
 
-    The cuts of a sample are its start, the knots in it, and its end. Each interval between cuts is
-    divided into `parts` parts.
+    Each array in `cuts` contains the start of a sample, the knots in it, and its end. Each interval
+    between these times is divided into `parts` parts. Each part has two steps, one for each
+    exponential in (10.3).
     """
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]

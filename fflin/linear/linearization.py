@@ -25,8 +25,8 @@ from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Upper bound of the sum of the squared entries. Larger models are refused, because computing their
-# eigenvalues would overflow.
+# Largest allowed sum of the squared entries of an array. A model with a larger sum is refused,
+# because the computation of its eigenvalues would overflow.
 LARGEST = 1e200
 
 _STANDING: Chart = Standing()
@@ -48,11 +48,12 @@ class Prepared:
     own_reference : bool
         Whether the reference is the base placement at each point.
     free : bool
-        Whether, for a model at rest, `common` and `rest` contain all matrices except the M^-1 in B.
+        Whether `common` and `rest` contain all matrices except B, if a model is at rest at its
+        reference.
     common : dict
         Fields of a model that are the same at all points.
     rest : dict
-        A, f0, u0 and v of a model at rest without any forces.
+        A, f0, u0 and v of a model at rest at its reference, without any forces.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Prepared:
                 "moving=True measures the error in the axes of the moving base, so no reference "
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
-        # In orbit, the default reference is the orbital frame, not the base placement.
+        # In orbit, the default reference is the orbital frame instead of the base placement.
         self.own_reference = reference is None and robot.orbit is None
         require_inertia(robot)
         self.actuation = Actuation(state)
@@ -127,10 +128,10 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # The ignorable coordinates are the same at all points. The position is ignorable because
-    # uniform gravity is the same everywhere. Without gravity, the attitude is ignorable too if it
-    # is relative to a moving reference (`lin.moving`). In orbit, the dynamics depend on both
-    # position and attitude.
+    # A coordinate is ignorable if the dynamics do not depend on it. The position of the base is
+    # ignorable, because uniform gravity is the same everywhere. Without gravity, the attitude
+    # relative to a moving reference (`lin.moving`) is ignorable too. In orbit, the dynamics depend
+    # on the position and on the attitude.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
@@ -236,8 +237,9 @@ class Linearizer:
             slow["placement"] = partial(own_reference, robot)
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether only B must be computed for a model at rest. This requires default inputs, outputs
-        # and reference, and no springs, gravity, orbit or stored momentum.
+        # Whether only B must be computed for a model at rest. The inputs, the outputs and the
+        # reference must then be the default ones, and the robot must have no springs, gravity,
+        # orbit or stored momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -257,7 +259,7 @@ class Linearizer:
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
-            # `_require_finite` reports an overflow, so NumPy need not warn of it.
+            # Suppress NumPy's warnings of an overflow, because `_require_finite` reports it.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
@@ -268,12 +270,12 @@ class Linearizer:
             inverse = out if actuation.default else np.empty((nv, nv))
             inertia.invert(q, inverse)
             if not actuation.default:
-                # The input matrix does not depend on the base position. So the base is moved to the
-                # origin, which avoids rounding errors.
+                # Move the base to the origin, which avoids rounding errors. This is allowed,
+                # because the input matrix B_u does not depend on the base position.
                 np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
-        # A copy cannot share the work space, so the constructor builds it again.
+        # The work space cannot be shared, so copies and pickles are built by the constructor.
         state, moving = self.prepared.map, self.prepared.moving
         reference = None if self.prepared.own_reference else state.reference
         make = partial(type(self), frame=state.frame, reference=reference, moving=moving)
@@ -333,7 +335,7 @@ class Linearizer:
 
 
 def _require_finite(*arrays: Array) -> None:
-    """Raise `InputError` if an array has NaN entries or too large a sum of squares."""
+    """Raise `InputError` if an array contains NaN or its sum of squares is not below `LARGEST`."""
     for array in arrays:
         if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(

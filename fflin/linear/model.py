@@ -170,9 +170,9 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     drift: Array | None = None
-    # For a model that was made from another model: its fingerprint, and the other model. The other
-    # model has the certificate. Its matrices also have exact zeros, which are lost by the matrix
-    # exponential of a discretisation.
+    # For a model that was made from another model: the fingerprint of the new model, and the other
+    # model. The certificate is computed from the other model. The matrices of the other model also
+    # have exact zeros, which the matrix exponential of a discretisation does not preserve.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
@@ -181,17 +181,17 @@ class LinearModel(StateSpace):
     mean_motion: float = 0.0
 
     def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
-        # The generated __init__ of a frozen dataclass would set three dozen fields one by one,
-        # which takes as long as the dynamics of a small robot. Instead, all models of a robot take
-        # most fields from `shared`.
+        # The generated `__init__` of a frozen dataclass would set three dozen fields one by one.
+        # This would take as long as the dynamics of a small robot. Instead, `shared` contains the
+        # fields that are equal in all models of a robot.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())
         vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> object:
-        # `shared["_computed"]` is {field: function of the model}. These fields are computed at
-        # first access, because they take as long as the dynamics.
+        # `shared["_computed"]` is {field: function of the model}. Such a field is computed at its
+        # first access, because its computation takes as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
@@ -416,13 +416,16 @@ class LinearModel(StateSpace):
 def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
-    # python-control reserves dots in signal names for its own system.signal syntax.
+    # Replace the dots in names, because python-control reserves dots for the form `system.signal`.
     states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 
 def refuse_sampled(dt: float, do: str) -> None:
-    """Raise `InputError` for a discrete-time model; `do` is the verb for the error message."""
+    """Raise `InputError` for a discrete-time model, for which dt > 0.
+
+    `do` is the verb of the error message, such as "check".
+    """
     if dt:
         raise InputError(
             f"the model is already sampled, at dt = {dt:g} s; {do} the continuous-time model "

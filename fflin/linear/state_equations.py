@@ -28,9 +28,9 @@ def assemble(
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
-    On entry, the upper half of A must have its values at rest: zero, except N in the right block
-    (2.1). `rates.slopes` is a view of the lower half of A, and `rates.by_u` is a view of the lower
-    half of B. This function converts both in place, from base axes to the chart and the frame.
+    On entry, the upper half of A must be [0, N], as at rest (2.1). The lower halves of A and B are
+    the arrays `rates.slopes` and `rates.by_u`, which contain derivatives in base axes. The function
+    converts these derivatives in place to the chart and the frame.
     """
     state = actuation.state
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
@@ -43,14 +43,14 @@ def assemble(
     theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Rows of attitude and position. If the base is at the reference, all blocks that are not set
-    # here have their values at rest.
+    # Write the rows of attitude and position. If the base is at the reference, the other blocks of
+    # these rows are the same as at rest (2.1).
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
-            # Add N W J. At the reference, this is W, because N = I/2 and J = 2 I.
+            # Add N W J. At the reference, N W J is W, because N = E/2 and J = 2 E.
             by_q_b += W if chart.standing else chart.over_q_b(product(chart.N, W))
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
@@ -59,10 +59,10 @@ def assemble(
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
 
-    # Convert the rows of the accelerations, which are still in base axes.
+    # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # Rotate no columns of the base's linear velocity, because they are zero.
+        # Do not rotate the columns of the base's linear velocity, because they are still zero.
         chart.turn_rows((ANGULAR,) if omega_in_reference else (), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)
@@ -89,17 +89,21 @@ def assemble(
 def _over_rotations(
     actuation: Actuation, chart: Chart, u: Array, rates: AccelerationDerivatives, W: Array
 ) -> Array:
-    """Differentiate the accelerations over base rotations (4.4); return (.., 6 + n, 3)."""
+    """Return the derivative (.., 6 + n, 3) of the accelerations over base rotations (4.4).
+
+    The function may change `rates.by_turn`, because it adds terms in place.
+    """
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn` is the derivative in base axes, which is converted in place. It is nonzero only in
-    # orbit. There, omega is in base axes, so the assignment below discards no nonzero value.
+    # `by_turn` is nonzero only in orbit, and in orbit, omega is in base axes. So if omega is in
+    # reference axes, the assignment below replaces only zeros.
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # Name the parts before changing them: `x[part] -= y` would copy the part onto itself.
+    # Change the parts through views with names: `theta[part] -= y` would also copy the result back
+    # into theta, which takes time.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
         turning -= skew(c[..., ANGULAR])
@@ -113,7 +117,11 @@ def _over_rotations(
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the state derivative (.., nx) of a moving reference; see the text below (5.3)."""
+    """Return the state derivative (.., nx) of a moving reference (section 5).
+
+    f0 is the state derivative of the robot. Under gravity, the result excludes the rotation about
+    the vertical, because this rotation does not affect the dynamics.
+    """
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
         return f0
@@ -132,7 +140,10 @@ def output_equations(
     x0: Array,
     point: Sequence[Array],
 ) -> dict[str, Array]:
-    """Return C, D and y0; `point` is q, v and, in base axes, nu (6 + n,) and u (nu,)."""
+    """Return C, D and y0 at one point.
+
+    `point` consists of q and v in Pinocchio's order, and of nu (6 + n,) and u (nu,) in base axes.
+    """
     state, a = sensing.state, rates.c.copy()
     q, v, nu, u = point
     if sensing.needs_acceleration:

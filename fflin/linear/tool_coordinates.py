@@ -14,8 +14,8 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Step of complex-step differentiation along a motion. Its square is lost by rounding in every sum,
-# so the derivatives are exact to machine precision.
+# Step of complex-step differentiation along a motion. The step is so small that its square vanishes
+# in every sum by rounding. So the derivatives are exact to machine precision.
 _STEP = 1e-20j
 
 _NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
@@ -25,8 +25,8 @@ _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # all others have rad or rad/s
 class Convention(NamedTuple):
     """Convention of a tool for the coordinates of a free-flyer."""
 
-    # Attitude in x: "wxyz", "q_b", "euler", "tangent" (a rotation vector), or "pose" (one tangent
-    # vector of attitude and position).
+    # Attitude in x': "wxyz" (a quaternion), "q_b", "euler", "tangent" (a rotation vector), or
+    # "pose" (one tangent vector for attitude and position).
     attitude: str
     stored: str  # attitude in q
     angular_first: bool
@@ -46,7 +46,7 @@ TOOLS = {
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of a tool's x' and u' at a point, over y (15.1) and over u in base axes."""
+    """Derivatives of a tool's x' over y (15.1), and of u in base axes over the tool's u' and y."""
 
     P: Array  # dx'/dy (15.2)
     rate: Array  # time derivative of P along the motion
@@ -68,16 +68,16 @@ class ToolCoordinates:
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
         swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular)
-        # X converts to the tool's base frame: the displacement is X y, the twist X nu and the
-        # wrench X^-T w.
+        # X converts from the frame of the root link to the base frame of the tool. A displacement y
+        # of the base becomes X y, a twist nu becomes X nu, and a wrench w becomes X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
         followers = () if own else map(attrgetter("joint"), robot.followers)
         self.joints = sorted((*robot.joints, *followers), key=attrgetter("idx_v"))
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [*map(attrgetter("idx_v"), self.joints)]
-        # Ratio of each velocity in nu to the tool's velocity. It differs from 1 only for Pinocchio,
-        # whose modal amplitudes are scaled.
+        # Ratio of each joint velocity of Pinocchio to the joint velocity of the tool. It differs
+        # from 1 only for modal amplitudes, which are scaled in Pinocchio's model.
         self._scales: Array = np.array([*map(attrgetter("scale"), self.joints)])
         if tool and kind.stored == "xyzw":
             self._scales[:] = 1.0
@@ -89,7 +89,7 @@ class ToolCoordinates:
                 "BaseForce needs a BaseTorque for its moment about the origin of the link; give "
                 "the robot a BaseTorque too"
             )
-        # For each input of the tool, the index of the robot's input.
+        # `inputs` contains, for each input of the tool, the index of the same input of the robot.
         self.inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
             self.inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
@@ -144,7 +144,7 @@ class ToolCoordinates:
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
     def _rotation(self, attitude: Array) -> Array:
-        """Return the rotation matrix (3, 3) of an attitude in the form in which q stores it."""
+        """Return the rotation matrix (3, 3) of an attitude that is given as in the tool's q."""
         if self.convention.stored == "euler":
             return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
@@ -158,7 +158,11 @@ class ToolCoordinates:
         return rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
-        """Return the attitude in x' as a quaternion x, y, z, w and as a rotation matrix."""
+        """Return the attitude of the tool's base as a quaternion x, y, z, w and as a matrix.
+
+        The attitude is relative to the reference. For fflin's own coordinates relative to a moving
+        reference, it is the identity.
+        """
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
@@ -167,26 +171,32 @@ class ToolCoordinates:
         return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
-        """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes."""
+        """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes.
+
+        If `rates` is True, the matrix converts omega to the rates of the Euler angles.
+        """
         rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
             rotation[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Differentiate two vectors in base axes over a base rotation (4.4); return (6, 3).
+        """Return the derivative (6, 3) of two vectors in base axes over a base rotation (4.4).
 
-        A vector that the tool expresses in world axes is constant there, so its components in base
-        axes depend on the rotation. Other vectors have the derivative zero.
+        A vector whose components the tool gives in world axes is constant in the world. Its
+        components in base axes then depend on the rotation. Other vectors have the derivative zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
-        """Return the derivatives at a point; nu (6 + n,), u (nu,), rates (6 + n,) in base axes."""
+        """Return the derivatives at a point with Pinocchio's q, and with nu and u in base axes.
+
+        `rates` (6 + n,) is d(nu)/dt.
+        """
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
-        # Take a complex step along the motion. If the reference moves with the robot, attitude
-        # errors and tangent vectors are constant, so their step is zero.
+        # Take a complex step along the motion. If the reference moves with the robot, the attitude
+        # error and the tangent vector of the pose stay zero, so they take no step.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
         turns = 0.5 * product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
@@ -217,7 +227,7 @@ class ToolCoordinates:
         extra = np.zeros((len(P), len(P)))
         if k == 7:
             extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(here, 1))
-        # Invert block by block, so that zeros remain exact.
+        # Invert P block by block, so that its exact zeros remain exact.
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
@@ -229,7 +239,10 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return a tool's coordinates of a robot; raise an error if the tool cannot represent it."""
+    """Return the coordinates of a tool for a robot.
+
+    Raise an error if the tool is unknown or cannot represent the robot.
+    """
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -238,7 +251,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement of the frame at the root link's centre of mass, in its inertia axes."""
+    """Return the placement of a frame on the root link: at its centre of mass, in inertia axes."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):
@@ -247,7 +260,10 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _joint_path(robot: Robot, name: str) -> list[int]:
-    """Return the file indices of the joints from the root to a joint; unlisted joints come last."""
+    """Return the index in the URDF of each joint on the path from the root to a joint.
+
+    A joint that is not in the URDF gets an index after the last one.
+    """
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
@@ -261,7 +277,10 @@ def _left(P: Array) -> Array:
 
 
 def _angles(R: Array) -> Array:
-    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll); R may be complex."""
+    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll).
+
+    R may have an imaginary part, as in complex-step differentiation.
+    """
     if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
         raise ChartError(
             "the pitch is 90 deg, where roll and yaw cannot be distinguished; use a tool without "
@@ -275,7 +294,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G, by which angle rates = G omega, and the derivative of G omega over the angles."""
+    """Return G of de/dt = G omega for the Euler angles e, and the derivative of G omega over e."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from fflin import Motion
     from fflin.base.validation import Array, Indices, Vector
 
-# Largest residual with which knots are accepted as a motion of the robot.
+# Largest residual at which the knots are accepted as a motion of the robot.
 _MOTION = 1e-2
 
-# Largest rotation [rad] of the base between two knots. Near pi, its direction would be ambiguous.
+# Largest rotation [rad] of the base between adjacent knots. For a rotation near pi, the knots do
+# not define the direction of rotation.
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
@@ -40,16 +41,17 @@ _CAUSES = (
     "or springs, damping or gravity that differ from the robot"
 )
 
-# Steps are halved until the state at the end of an interval has the accuracy _ACCURACY, relative to
-# the largest rates, or until there are _MOST_STEPS steps.
+# The integration over an interval is repeated with halved steps, until the state at the end changes
+# by at most _ACCURACY, or until the interval has _MOST_STEPS steps. The change is divided by the
+# duration of the interval and by the largest rates.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Relative rounding errors of a position and of an acceleration. The latter is relative to the terms
-# whose sum is the acceleration.
+# Rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest position.
+# _SUM_ROUNDING is the error of an acceleration, relative to the terms whose sum it is.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# A time that is less than this fraction of an interval away from a knot counts as the knot.
+# A time counts as a knot if its distance from the knot is less than this fraction of the interval.
 _NEAR = 1e-9
 
 
@@ -155,7 +157,7 @@ class Trajectory(Design):
         )
 
     def _report(self) -> str:
-        """Describe the trajectory, with its residual or the reason why it is not a motion."""
+        """Return text about the trajectory, with its largest residual or its `_fault`."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         return folded([repr(self), said, *self._note.splitlines()])
 
@@ -212,7 +214,10 @@ class Trajectory(Design):
         return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
-        """Return the inputs, in the axes of `frame`, at a fraction (0 to 1) of the intervals k."""
+        """Return the inputs, in the axes of `frame`, within the intervals k.
+
+        `fraction` is the part of each interval that has elapsed, from 0 to 1.
+        """
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
 
@@ -255,7 +260,10 @@ class Trajectory(Design):
 
     @property
     def _fault(self) -> str:
-        """Return why the knots are not a motion of the robot, or an empty text."""
+        """Return the reason why the trajectory is invalid, or an empty text.
+
+        Either the knots are not a motion of the robot, or the base rotates too far in one interval.
+        """
         missed = self.interval_errors
         k = int(missed.argmax())
         where = f"'{self.robot.name}': from t = {self.t[k]:g} to {self.t[k + 1]:g} s"
@@ -346,9 +354,11 @@ class Trajectory(Design):
 
         The error is infinite if the integration overflows.
         """
-        # Velocities are relative to an observer who moves at the base's median velocity (Galilean
-        # invariance), so a high orbital velocity does not hide an error. Each rotor has its own
-        # scale, so a fast wheel does not hide an error either.
+        # Errors are divided by the largest velocities and accelerations of the motion. A high
+        # orbital velocity of the base would hide errors. Therefore subtract the median velocity of
+        # the base, which does not change the accelerations (Galilean invariance). A fast wheel
+        # would hide the errors of joints with the same divisor. Therefore each rotor has its own
+        # divisor.
         t, u, state = self.t, self.u, self._aba.state
         rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -361,7 +371,7 @@ class Trajectory(Design):
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
         terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
-        # Largest magnitudes over all knots; infinite or NaN entries count as zero.
+        # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
         push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
         rotors = state.robot.rotors
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
@@ -377,8 +387,8 @@ class Trajectory(Design):
             return float(np.maximum(miss, jump).max())
 
         found, steps, model = [], 1, self.robot.model
-        # If the knots are not a motion of the robot, the integration may overflow. The residual
-        # shows this, so NumPy need not warn.
+        # If the knots are not a motion of the robot, the integration may overflow. NumPy need not
+        # warn, because an overflow makes the error of the interval infinite.
         with np.errstate(all="ignore"):
             for k, h in enumerate(np.diff(t).tolist()):
                 steps = max(1, steps // 4)
@@ -408,7 +418,7 @@ class Trajectory(Design):
 
     @cached_property
     def cubics(self) -> Array:
-        """Coefficients (2, N - 1, 4, nv) of the displacement within each interval, and of v."""
+        """Coefficients (2, N - 1, 4, nv) of the cubic polynomials for displacement and velocity."""
         q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
         begin = self._aba.accelerations(q, v, self.u_base)
         end = begin[1:]
@@ -417,8 +427,8 @@ class Trajectory(Design):
             end = self._aba.accelerations(q[1:], v[1:], u)
         apart = np.array([pin.difference(model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
-        # The knots give the angle of a wheel only modulo full turns. Compute the number of full
-        # turns from the wheel's speed.
+        # The knots give the angle of a continuous joint only modulo full turns. Compute the number
+        # of full turns between two knots from the speed of the joint.
         turns = (0.5 * h * (v[1:] + v[:-1]) - apart)[:, wheels] / (2.0 * np.pi)
         apart[:, wheels] += 2.0 * np.pi * np.round(turns)
         slopes = [
@@ -430,7 +440,7 @@ class Trajectory(Design):
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
-    """Return q (count, nq); convert continuous joints to (cos, sin) if they are given as angles."""
+    """Return q (count, nq); convert angles of continuous joints to (cos, sin)."""
     rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
     narrow = (count, robot.nq - len(cosines))
     if rows.shape == (count, robot.nq):
@@ -447,7 +457,10 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
 
 
 def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
-    """Return, for each of the `times` (k,), the index of its interval and the elapsed fraction."""
+    """Return the interval index (k,) of each time, and the elapsed fraction (k,) of the interval.
+
+    `t` contains the times of the knots.
+    """
     k = t[1:-1].searchsorted(times, "right")
     fraction = (times - t[k]) / (t[k + 1] - t[k])
     ends = (fraction > 1.0 - _NEAR) & (k < len(t) - 2)
@@ -456,7 +469,10 @@ def intervals_of(t: Array, times: Array) -> tuple[Indices, Array]:
 
 
 def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
-    """Return the coefficients (N - 1, 4, ..) of cubics over [0, 1] from end values and rates."""
+    """Return cubic polynomials over [0, 1] with given values and rates at both ends.
+
+    The result (N - 1, 4, ..) contains the coefficients in the order of increasing powers.
+    """
     apart = last - first
     return np.stack(
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
@@ -464,9 +480,10 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
 
 
 def along(motion: Motion, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory with constant or linear inputs.
+    """Convert a motion to a trajectory with constant or linear inputs between the knots.
 
-    Of the two, the inputs with the smaller residual are chosen.
+    If the inputs vary, both trajectories are computed. The result is the trajectory whose largest
+    residual is smaller.
     """
     if motion.phases:
         raise InputError(

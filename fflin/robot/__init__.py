@@ -1,5 +1,6 @@
 """Robots, made from a file or from a `pinocchio.Model`.
 
-A robot is a free-flying tree of joints with inputs, outputs, springs and locked joints. The package
-also contains the catalogue of robot names; `robot.urdf` reads URDF files. It imports `base`.
+A robot is a free-flying tree of links and joints with inputs, outputs and springs. Joints can be
+locked. The package also contains the catalogue of robot names, and `robot.urdf`, which reads URDF
+files. The package imports `base`.
 """

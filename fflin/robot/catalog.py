@@ -1,4 +1,4 @@
-"""Catalogue of robots: functions that find URDFs, files of inputs and meshes."""
+"""Catalogue of robots: functions that find URDF files, mesh files and files of inputs."""
 
 import os
 from collections.abc import Sequence
@@ -37,12 +37,13 @@ def _bundled() -> dict[str, RobotFile]:
 
 @cache
 def _example_robot_data() -> dict[str, RobotFile]:
-    # Only class attributes of a loader are read, because creating the loader would load meshes.
+    # Read only the class attributes of a loader, because creating the loader would load meshes.
     from example_robot_data.robots_loader import ROBOTS, getModelPath
 
     found = {}
     for name, loader in ROBOTS.items():
-        # The package builds talos_legs in code from another robot, so it has no URDF.
+        # example-robot-data builds talos_legs in code from another robot, so talos_legs has no
+        # URDF.
         if loader.urdf_filename and name != "talos_legs":
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
@@ -69,7 +70,10 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find a robot by a bundled name, by a path in `folder`, or by a name in example-robot-data."""
+    """Find a robot by its name, or by the path of its file, which is relative to `folder`.
+
+    Bundled names take precedence over paths, and paths over names in example-robot-data.
+    """
     instance("robot", robot, (str, os.PathLike), "a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
@@ -77,9 +81,10 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     bundled = bundled_directory() / text
     if not os.path.exists(path) and bundled in bundled_directory().glob("*.toml"):
         path = bundled
-    # Unlike `os.path.exists`, Path.exists would raise an error for a name that is too long.
+    # For a name that is too long, `os.path.exists` returns False. `Path.exists` would raise an
+    # error.
     if os.path.exists(path) and not (path.is_dir() and text in _example_robot_data()):
-        # File names may contain bytes that are not valid text.
+        # File names may contain bytes that are not valid text. Escape these bytes.
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
@@ -90,7 +95,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by its bundled name, or otherwise by its path."""
+    """Find a file of inputs by its name if the file is bundled, or otherwise by its path."""
     path, name = as_path(inputs), str(inputs)
     bundled = {each.stem: each for each in sorted(bundled_directory().glob("*.toml"))}
     if path.name == name and not path.suffix and not os.path.lexists(path):
@@ -99,7 +104,7 @@ def find_inputs(inputs: str | Path) -> Path:
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
-    """Return one folder or a list of folders as paths, which are relative to `within`."""
+    """Return the paths of one or several given folders; relative paths begin at `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):
         raise InputError(f"package_dirs is {given!r}, expected a list of folders")
@@ -107,9 +112,9 @@ def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """Return the file of a mesh, or None if it does not exist.
+    """Return the path of a mesh file, or None if the file does not exist.
 
-    The URI of the mesh is package://NAME/PATH, file:///PATH or a path.
+    The `uri` of the mesh is package://NAME/PATH, file:///PATH or a path.
     """
     scheme, separator, rest = uri.partition("://")
     if not separator:
@@ -118,8 +123,9 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [Path(unquote(rest))]
     else:
         folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
-        # A given folder may contain the package folder. Or it may be the package folder itself,
-        # possibly under another name.
+        # Each of these folders may contain the folder NAME of the package, or may itself be the
+        # folder of the package, possibly under another name.
         candidates = [folder / part for part in (rest, inside) for folder in folders]
-    # Unlike `os.path.isfile`, Path.is_file would raise an error for a name that is too long.
+    # For a name that is too long, `os.path.isfile` returns False. `Path.is_file` would raise an
+    # error.
     return next((path for path in candidates if os.path.isfile(path)), None)

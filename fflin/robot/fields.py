@@ -1,4 +1,4 @@
-"""Checks of the fields that a user may set on a robot, and the limits that the robot has."""
+"""Checks of the fields that a user may set on a robot, and limits of its inputs and states."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RULES = ("urdf", "identity")
 
 
 def _input_keys(robot: Robot) -> tuple[str, ...]:
-    """Return input names with groups, such as "thrust.NAME"; see `fflin.base.names.input_keys`."""
+    """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
@@ -37,7 +37,8 @@ def _input_keys(robot: Robot) -> tuple[str, ...]:
 def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     """Return limits as {input or state: (least, largest)}.
 
-    The limits are given by name, or as one limit for all inputs.
+    `given` contains limits by name, or is one limit for all inputs. Limits of thrusters are raised
+    to at least 0, because a thruster never pulls.
     """
     named = robot.named_inputs
     keys, states = _input_keys(robot), state_keys(robot.joint_names)
@@ -49,7 +50,8 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
-    # A limit for all joints does not apply to wheels, because wheels are much faster.
+    # A limit of the whole group q_m or qdot_m does not apply to wheels, because wheels rotate much
+    # faster than joints.
     groups: Sequence[str] = ("q_m", "qdot_m")
     wheels = {f"{x}.{own[0]}" for item, own in named if item.GROUP == "wheel" for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
@@ -61,7 +63,7 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
 
 
 def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
-    """Return outputs from `Output` objects, or from text in the form of the command line."""
+    """Return outputs; `value` contains `Output` objects, or text such as "pose:tool"."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
         raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
@@ -72,11 +74,11 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
 
 
 def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
-    """Return the stiffness, damping or rest positions {joint: value}.
+    """Return the field `what` (stiffness, damping or rest) as {joint: value}.
 
-    One value of stiffness or damping applies to all joints except wheels and modes. Wheels and
-    modes must be named exactly, because patterns do not match them. The damping "urdf" stands for
-    the damping in the URDF.
+    A single value of stiffness or damping applies to all joints except wheels and modes. Patterns
+    do not match wheels and modes either; these must be named exactly. The damping "urdf" stands
+    for the damping in the URDF.
     """
     if what == "damping" and isinstance(value, str):
         if value != "urdf":
@@ -95,7 +97,7 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
 
 
 def range_of(name: str, value: object) -> Range:
-    """Return (least, largest) from such a pair, or (-size, size) from one magnitude."""
+    """Return a limit as (least, largest); one number x stands for (-x, x)."""
     what = f"limit of '{name}'"
     bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
     if len(bounds) == 2:
@@ -112,7 +114,7 @@ def range_of(name: str, value: object) -> Range:
 
 
 def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
-    """Check a point, start or target of a robot, and replace patterns by the names of joints."""
+    """Return the checked `point`, `start` or `target`, with patterns replaced by joint names."""
     state = _parts(what, value, ("joints", "rpy", "position", "velocity"))
     if "joints" in state:
         values = numbers(f"{what} joints", state["joints"], "joint", f"{what} of joint")
@@ -127,7 +129,7 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
 
 
 def _weights(value: object, robot: Robot) -> dict[str, object]:
-    """Check the weights of a robot's regulator, whose keys name states and inputs."""
+    """Return checked weights of the regulator; their keys are names of states and inputs."""
     states, inputs = state_keys(robot.joint_names), _input_keys(robot)
     both = (*states, *inputs)
     kinds = {"q": ("state", states), "r": ("input", inputs), "bryson": ("state or input", both)}
@@ -149,7 +151,7 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
 
 
 def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
-    """Check the names of joints without a motor, and return them in the order of the state."""
+    """Return the joints without a motor in state order; `value` contains names or patterns."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
@@ -164,8 +166,9 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
     return dict(value)
 
 
-# Checks of the fields, in the order in which a robot file applies them. Inputs come before the
-# fields that refer to the inputs by name. `Robot.replace` checks the first three fields itself.
+# Checks of the fields, in the order in which the fields of a robot file are applied. Inputs come
+# before the fields that refer to inputs by name. The first three fields have no check here, because
+# `Robot.replace` checks them itself.
 FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
     **dict.fromkeys(("passive", "inputs", "appendages")),
     "outputs": _outputs,
@@ -183,8 +186,9 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Start with the limits of the URDF; a limit of zero counts as no limit, because exporters write
-    # it. Limits of the inputs override the URDF, and `Robot.limits` overrides both.
+    # Start with the limits of the URDF. A limit of zero counts as no limit, because exporters write
+    # 0 for unknown limits. Limits of the inputs replace limits of the URDF, and `Robot.limits`
+    # replaces limits of the URDF and of the inputs.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         low, high = travel_of(robot.model, joint)
@@ -204,7 +208,11 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 
 
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
-    """Return the smallest and largest value (nu,) of each input; thrusts are never negative."""
+    """Return the lower and the upper limits (nu,) of the inputs; a missing limit is infinite.
+
+    The lower limit of a thruster is at least 0. The upper limit of a pulsed thruster is at most its
+    own `max`.
+    """
     found: list[Range] = []
     for item, names in robot.named_inputs:
         for name in names:
@@ -223,7 +231,7 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
 
 
 def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
-    """Return the pulsed thrusters {index of the input: (name, thruster)}."""
+    """Return the thrusters that fire in pulses, as {index of the input: (name, thruster)}."""
     inputs = ((name, item) for item, names in robot.named_inputs for name in names)
     return {
         index: (name, item)
@@ -235,8 +243,10 @@ def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 def magnitudes_of(robot: Robot) -> dict[str, float]:
     """Return {input or state: magnitude} for all limits whose magnitude is finite and not zero.
 
-    For a joint position, the magnitude is the range from the lower to the upper limit. The same
-    holds if the lower limit is not negative. Otherwise, it is the smaller of both magnitudes.
+    The magnitude of limits (least, largest) is
+
+    - the range largest - least for a joint position, or if least is not negative;
+    - otherwise the smaller of -least and largest.
     """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
@@ -245,10 +255,13 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return the limits at which `simulate` saturates inputs, and all known limits."""
-    own, cutting = limits_of(robot), dict[str, Range]()
-    given: dict[str, Range] = {}
+def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
+    """Return the limits that the argument `limits` selects.
+
+    The text "urdf" in `limits` selects all limits of the robot. Any other entry of `limits` is
+    selected, and replaces the limit of the robot.
+    """
+    own, given = dict[str, Range](), dict[str, Range]()
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
     for part in limits if isinstance(limits, list | tuple) and several else [limits]:
         if isinstance(part, str):
@@ -257,14 +270,14 @@ def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[
                     f"limits is '{part}', expected 'urdf', a largest magnitude, {{input: "
                     "magnitude}, or ['urdf', {input: magnitude}]"
                 )
-            cutting = own
+            own = limits_of(robot)
         elif part is not None:
             given |= _given_limits(part, robot)
-    return cutting | given, own | given
+    return own | given
 
 
 def travel_of(model: pin.Model, joint: Joint) -> Range:
-    """Return the position limits of a joint in its model; a missing limit is infinite."""
+    """Return the position limits of a joint from the model; a missing limit is infinite."""
     if joint.unbounded:
         return _OPEN
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit

@@ -1,4 +1,4 @@
-"""Inputs u of the linear model: forces and torques on a robot, in any mix and order."""
+"""Inputs u of the linear model: forces and torques on a robot, in any combination and order."""
 
 import math
 from collections import Counter
@@ -20,7 +20,7 @@ Vector3: TypeAlias = Sequence[float]
 
 @dataclass(frozen=True)
 class Input:
-    """Base class of inputs, with their limits and names."""
+    """Base class of inputs, which checks their limits and names."""
 
     KEY: ClassVar[str]  # `type` in a TOML file
     GROUP: ClassVar[str]  # common name of all inputs of this class in weights and limits
@@ -28,9 +28,10 @@ class Input:
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
 
-    # Largest value, in UNIT: one number, or three for a torque or force on the base.
+    # Upper limit in UNIT: one number, or three numbers for the entries of a torque or force on the
+    # base.
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
-    # Least value: by default -max, or 0 for a thruster.
+    # Lower limit in UNIT; by default -max, or 0 for a thruster.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
@@ -55,7 +56,7 @@ class Input:
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """Range (least, largest) of each entry; a value without a limit is infinite."""
+        """Limits (least, largest) of each entry of the input; a missing limit is infinite."""
         largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
         least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
@@ -275,7 +276,7 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 
 def three_numbers(what: str, value: object) -> tuple[float, float, float]:
-    """Return three finite floats, or raise `InputError` with the given value."""
+    """Return three finite floats; raise `InputError` if the value is anything else."""
     try:
         x, y, z = (number(what, entry) for entry in cast("Iterable[object]", value))
     except (TypeError, ValueError):
@@ -284,7 +285,7 @@ def three_numbers(what: str, value: object) -> tuple[float, float, float]:
 
 
 def unit_vector(what: str, value: object) -> tuple[float, float, float]:
-    """Return three numbers scaled to length 1, or raise `InputError` if they are zero."""
+    """Return a vector (3,) scaled to length 1; raise `InputError` if its length is zero."""
     x, y, z = three_numbers(what, value)
     length = math.hypot(x, y, z)
     if length == 0.0:
@@ -293,9 +294,10 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
 
 
 def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tuple[Input, ...]:
-    """Check inputs; replace a torque on a pattern of joints by one torque for each joint.
+    """Return checked inputs.
 
-    `bare` is the robot without wheels and modes.
+    A `JointTorque` whose joint is a pattern is replaced by one torque for each matching joint that
+    is not in `passive`. `bare` is the robot without the joints of wheels and modes.
     """
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is {value!r}, expected a sequence of inputs")
@@ -327,7 +329,7 @@ def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tupl
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
-    """Return (input, names of its entries in u) for each input.
+    """Return each input with the names of its entries in u, as (input, names).
 
     The default names of thrusters and wheels are thruster_1, ... and wheel_1, ...
     """
@@ -345,6 +347,6 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
 
 
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
-    """Return (name, wheel) for the wheels among inputs; default names are wheel_1, wheel_2, ..."""
+    """Return (name, wheel) for each wheel among the inputs, with names as in `named_inputs`."""
     found = named_inputs(inputs)
     return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]

@@ -1,4 +1,4 @@
-"""Joints and frames of a model by name, and checks of configurations in Pinocchio's order."""
+"""Joints and frames of a model, found by name, and checks of configurations and velocities."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -17,10 +18,10 @@ from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
-# Largest rounding error of the length of a normalised quaternion: two ulp of 1.
+# Largest rounding error of the length of a normalised quaternion: two units in the last place of 1.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
-# pin.Data takes about 32 nv^3 bytes, because it contains third-order tensors of nv^3 entries.
+# A `pin.Data` takes about 32 nv^3 bytes, because it contains four tensors with nv^3 entries each.
 _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
@@ -38,9 +39,10 @@ class Joint(NamedTuple):
     # "joint", "slosh" for a coordinate of a sloshing mass, or "modal" for a modal amplitude.
     kind: str = "joint"
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
-    # Inertia of a mode when its link is fixed in space; 1 for a modal amplitude.
+    # Generalised inertia of a mode while its link is fixed in space; 1 for a modal amplitude.
     inertia: float = 1.0
-    # Largest rotation [rad] of the structure per unit of a mode; 0 if it does not rotate.
+    # Bound on the rotation [rad] of the appendage or slosh mass per unit of the mode's coordinate;
+    # 0 if the mode only translates.
     rotation: float = 0.0
 
     @property
@@ -59,7 +61,7 @@ class Joint(NamedTuple):
         return self.kind != "joint"
 
     def oscillation(self, stiffness: float, damping: float) -> tuple[float, float]:
-        """Return a mode's frequency [rad/s] and damping ratio when its link is fixed in space."""
+        """Return a mode's frequency [rad/s] and damping ratio while its link is fixed in space."""
         omega = math.sqrt(stiffness / self.inertia)
         return omega, 0.5 * damping / (self.inertia * omega)
 
@@ -80,7 +82,7 @@ class Joint(NamedTuple):
         return np.arctan2(q[self.idx_q + 1], at) if self.unbounded else at / self.scale
 
     def within(self, model: pin.Model) -> Joint:
-        """Return this joint with the indices that it has in another model, found by name."""
+        """Return this joint with its indices in `model`, which has a joint of the same name."""
         joint = model.joints[model.getJointId(self.name)]
         return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
 
@@ -94,7 +96,7 @@ class Follower(NamedTuple):
     offset: float
 
     def within(self, model: pin.Model) -> Follower:
-        """Return this mimic joint with the indices of its joints in another model."""
+        """Return this mimic joint with its own indices and its leader's indices in `model`."""
         return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
 
 
@@ -103,12 +105,12 @@ Find: TypeAlias = Callable[[str], Joint]
 
 
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
-    """Return {joint: value} from {joint or pattern: value}; ``q_m`` stands for all joints."""
+    """Return {joint: value} from {joint or pattern: value}; the key ``q_m`` means all joints."""
     return joints_by_name("joint", values, joints, find)
 
 
 class Carried(NamedTuple):
-    """Location of a frame: the joint that carries it, and its placement on that joint."""
+    """Location of a frame: index of the joint that carries it, and placement on this joint."""
 
     joint: int
     placement: pin.SE3
@@ -116,10 +118,10 @@ class Carried(NamedTuple):
 
 def frame_index(model: pin.Model, name: str) -> int:
     """Return the index of a frame; if a link and a joint share a name, return the link's frame."""
-    # Pinocchio's own search refuses a name that a link and a joint share. It also mistakes a link
-    # named "universe" for the world.
+    # Do not use Pinocchio's `getFrameId`: it refuses a name that a link and a joint share, and
+    # mistakes a link named "universe" for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
-    # The type is checked first, because the comparison of a string with an array gives an array.
+    # Check the type of `name` first. If `name` were an array, the comparison would give an array.
     found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not found:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
@@ -127,7 +129,7 @@ def frame_index(model: pin.Model, name: str) -> int:
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
-    """Return the location of a frame; None means the frame of the base's root joint."""
+    """Return the location of a frame; the name None stands for the frame of the root joint."""
     if name is None:
         return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
@@ -135,7 +137,7 @@ def find_frame(model: pin.Model, name: str | None) -> Carried:
 
 
 def find_joint(model: pin.Model, name: str) -> Carried:
-    """Return the location of a joint's frame, even if the joint was welded."""
+    """Return the location of the frame of a joint, which may be welded."""
     if model.existJointName(name):
         return Carried(model.getJointId(name), pin.SE3.Identity())
     frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
@@ -152,14 +154,14 @@ class Coordinates:
     followers: tuple[Follower, ...] = ()
     # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy made with the robot. Their comparison shows whether the model has
-    # changed since.
+    # The model, and a copy of it from the time when the robot was made. If the model differs from
+    # the copy, it was changed later.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints, in state order."""
-        return tuple(joint.name for joint in self.joints)
+        return tuple(map(attrgetter("name"), self.joints))
 
     @cached_property
     def n(self) -> int:
@@ -194,7 +196,11 @@ class Coordinates:
             joint.place(q, multiplier * leader.values(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
-        """Return q (nq,) with errors of up to 1e-6 corrected, or raise `InputError`."""
+        """Return q (nq,) with small errors corrected; raise `InputError` for errors above 1e-6.
+
+        The lengths of the base quaternion and of each pair (cos, sin) are corrected to 1. The
+        mimic joints are corrected to the positions that follow from their leaders.
+        """
         near = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
         if not pin.isNormalized(self.model, near, ROUND_OFF):
             parts = {(3, 7): "the base quaternion (x, y, z, w) q[3:7]"}
@@ -221,7 +227,7 @@ class Coordinates:
         return v
 
     def _sized(self, name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-        """Return a vector (size,); the error for a longer vector names removed coordinates."""
+        """Return a vector (size,); if `value` is too long, the error names removed coordinates."""
         if self._removed and np.size(value) > size:
             gone = ", ".join(self._removed)
             of_what += (
@@ -230,7 +236,10 @@ class Coordinates:
         return vector(name, value, size, of_what)
 
     def _followed(self, q: Array) -> Array:
-        """Return a copy of q (nq,) with mimic joints corrected; refuse errors above 1e-6."""
+        """Return a copy of q (nq,) in which each mimic joint follows its leader exactly.
+
+        Raise `InputError` if a mimic joint in q deviates by more than 1e-6.
+        """
         placed = q.copy()
         self.follow(placed)
         for joint, leader, *_ in self.followers:
@@ -247,7 +256,8 @@ class Coordinates:
     def require_unchanged(self) -> None:
         """Raise `ModelError` if the model was changed in place after the robot was made."""
         made = self._as_made[1] if self._as_made else self.model
-        # The comparison takes a microsecond; `change_in` runs only if the models differ.
+        # Comparing the models takes a microsecond. `change_in` is slower, so call it only if they
+        # differ.
         if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
                 f"the model of '{self.name}' was changed after the robot was made: {change}; make "
@@ -271,9 +281,9 @@ def require_room(model: pin.Model, name: str) -> None:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Return the name of a changed part on which A, B or C depends, or an empty text.
+    """Return the name of a part of `model` that differs from `made`, or an empty text.
 
-    Changed limits and new frames are ignored.
+    Only parts on which A, B or C depends are compared. Changed limits and new frames are ignored.
     """
     of_joints = {"joints": "axis", "jointPlacements": "placement", "inertias": "inertia"}
     for name in ("names", "parents", *of_joints, "armature", "frames"):
@@ -288,7 +298,7 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:
-    """Return a joint; raise `ModelError` unless it has one degree of freedom."""
+    """Return joint `index` of a model; raise `ModelError` unless it has one degree of freedom."""
     joint, name = model.joints[index], model.names[index]
     kind = joint.shortname()
     if kind == "JointModelMimic":

@@ -1,6 +1,7 @@
-"""Robots loaded from a URDF or robot file, or made from a Pinocchio model.
+"""Robots, loaded from a URDF or a robot file, or made from a Pinocchio model.
 
-A robot file is a TOML file that names a URDF and gives its inputs, outputs and other fields.
+A robot file is a TOML file that names a URDF, and sets inputs, outputs and other fields of the
+robot.
 """
 
 import warnings
@@ -32,10 +33,11 @@ from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
 
-# Fields written as arrays of tables in TOML, such as [[input]]: {field: names of the arrays}.
+# Fields that a robot file gives as arrays of tables, as {field: names of the arrays}. For example,
+# the tables [[input]] give the field `inputs`.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
-# Keys of a robot file, which the guide explains; a file without `urdf` contains only inputs.
+# Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
 KEYS = (
     *("urdf", "package_dirs", "lock"),
     *(table for tables in _TABLES.values() for table in tables),
@@ -114,8 +116,8 @@ def load(
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
-    # Register the meshes, because they are read only later, when the robot is drawn. An output file
-    # must not overwrite them.
+    # Register the mesh files now, so that no output file can overwrite them. The meshes are read
+    # only later, when the robot is drawn.
     remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
     loaded = replace(
         loaded,
@@ -138,7 +140,8 @@ def load(
     if later:
         loaded = welded(loaded, later)
     loaded = loaded.merged(fields)
-    # Leave out a warning if each of its joints is locked or is named in the warning's field.
+    # Omit a warning if each of its joints is locked, is named in the robot's field `field`, or
+    # mimics such a joint.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
     for field, names, text in ignored(urdf.joints, found.path.stem):
@@ -149,7 +152,8 @@ def load(
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if loaded.idle_coordinates:
-        # Add a note without a warning, because every function that inverts M raises an error.
+        # Add a note that M is singular. Do not warn, because every function that inverts M raises
+        # an error.
         notes.append(massless_note(loaded))
     return replace(loaded, notes=tuple(notes))
 
@@ -206,7 +210,7 @@ def from_model(
 
 
 def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
-    """Make a robot from a model, which must be one tree in depth-first order on a free-flyer."""
+    """Make a robot from a model: one tree on a free-flyer, with joints in depth-first order."""
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -226,15 +230,15 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
     by_name = {model.names[i]: joint_of(model, i) for i in range(ROOT + 1, model.njoints)}
     joints = tuple(joint for name, joint in by_name.items() if name not in mimics)
     followers = tuple(Follower(by_name[x], by_name[m.leader], *m[1:]) for x, m in mimics.items())
-    # In depth-first order, the indices of each subtree have no gaps.
+    # In depth-first order, the joint indices of each subtree are consecutive.
     if any(subtree[len(subtree) - 1] - subtree[0] >= len(subtree) for subtree in model.subtrees):
         raise ModelError(
             f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA gives "
             "wrong results; add all joints of one branch before the joints of the next branch"
         )
     damping = {joint.name: float(model.damping[joint.idx_v]) for joint in joints}
-    # The damping of a mimic joint is moved to its leader. The factor multiplier^2 keeps the
-    # dissipated power.
+    # Add the damping of each mimic joint to its leader. The factor multiplier^2 keeps the
+    # dissipated power the same.
     for each, leader, multiplier, _ in followers:
         damping[leader.name] += multiplier**2 * float(model.damping[each.idx_v])
     return Robot(model, name, joints, followers, locked=locked, urdf_damping=damping)
@@ -266,7 +270,7 @@ def _check_model(model: pin.Model, name: str) -> None:
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:
-    """Return a robot that consists of one body without joints; the body must have a mass."""
+    """Return a robot that is one body without joints; the mass of `payload` must be positive."""
     inertia = given_body("payload", payload, payload)
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
@@ -353,7 +357,10 @@ def _document(path: Path) -> TomlFile:
 
 
 def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, object]]:
-    """Read a robot file; return it, its URDF, and its locks and fields, in `FIELDS` order."""
+    """Read a robot file; return its document, the location of its URDF, and its values.
+
+    The values are {key: value}: the locks, then the fields in the order of `FIELDS`.
+    """
     document = _document(file.path)
     record, folder = document.record, file.path.parent
     if "urdf" not in record:
@@ -367,7 +374,8 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
             raise InputError(f"urdf is {found.path}, expected a URDF or a robot's name")
     with document.located("package_dirs"):
         dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
-    # Nested tables become keys with dots. The parts of weights and states remain tables.
+    # Nested tables become keys with dots. Only the tables directly below weights, point, target and
+    # start, such as point.joints, remain tables.
     values = {key: flat(value) for key, value in record.items()}
     for key in ("weights", "point", "target", "start"):
         if isinstance(table := record.get(key), dict):
@@ -378,7 +386,7 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     appendages = _built(document, "flexible", partial(_maker, FlexibleAppendage, of_nastran))
     if appendages := appendages + _built(document, "slosh", partial(_maker, Slosh, of_tank)):
         values["appendages"] = appendages
-    # The robot has the name of the TOML file, not of the URDF.
+    # The robot is named after the TOML file, not after the URDF.
     found = found._replace(name=file.name, package_dirs=dirs)
     return document, found, {key: values[key] for key in ("lock", *FIELDS) if key in values}
 
@@ -392,7 +400,7 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
 
 
 def _input_type(values: dict[str, object]) -> type[Input]:
-    """Remove the type from the values of an input, and return the class that it names."""
+    """Remove the key `type` from the values of an input, and return the class of this type."""
     if "type" not in values:
         raise InputError(f"the key 'type' is missing; set 'type' to one of {', '.join(_TYPES)}")
     kind = str(values.pop("type"))
@@ -403,7 +411,10 @@ def _input_type(values: dict[str, object]) -> type[Input]:
 def _maker(
     make: Callable[..., Appendage], special: Callable[..., Appendage], values: Mapping[str, object]
 ) -> Callable[..., Appendage]:
-    """Return `special` if a key is valid only for a Nastran file or a cylindrical tank."""
+    """Return `special` if `values` contains a key that only `special` accepts, or else `make`.
+
+    `special` makes an appendage from a Nastran file, or slosh from the size of a cylindrical tank.
+    """
     alone = set(signature(special).parameters) - set(signature(make).parameters)
     return special if alone & set(values) else make
 
@@ -411,9 +422,9 @@ def _maker(
 def _built(
     document: TomlFile, key: str, choose: Callable[[dict[str, object]], Callable[..., T]]
 ) -> list[T]:
-    """Build an object from each table of an array; errors begin with file and line.
+    """Build an object from each table of the array `key`; messages begin with file and line.
 
-    `choose` returns the class or function that builds the object from given values.
+    From the values of a table, `choose` selects the class or function that builds the object.
     """
     tables = document.record.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(x, dict) for x in tables):

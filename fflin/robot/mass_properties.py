@@ -1,17 +1,19 @@
-r"""Mass properties of links and bodies, their changes, and motions without kinetic energy.
+r"""Mass properties of links and bodies, changes of them, and motions without kinetic energy.
 
-A body has mass m, centre of mass c and inertia I about c. With the identity matrix E, the second
-moments of its mass distribution about c are :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The
-pseudo-inertia P (4, 4) contains m, m c and the second moments about the origin,
-:math:`\Sigma + m c c^T`. It is linear in the mass distribution. The body is physically realisable
-if and only if P is positive semidefinite (Wensing, Kim and Slotine, Linear matrix inequalities for
-physically-consistent inertial parameter identification, IEEE Robotics and Automation Letters 3(1),
-2018).
+Let a body have the mass m, the centre of mass c and the inertia I about c. With the identity matrix
+E, the second moments of its mass distribution about c are
+:math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. The pseudo-inertia P (4, 4) consists of m, of the
+vector m c, and of the second moments about the origin, :math:`\Sigma + m c c^T`. P is linear in the
+mass distribution. The body is physically realisable if and only if P is positive semidefinite
+(Wensing, Kim and Slotine, Linear matrix inequalities for physically-consistent inertial parameter
+identification, IEEE Robotics and Automation Letters 3(1), 2018).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import filterfalse
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,23 +31,27 @@ if TYPE_CHECKING:
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-# Largest relative rounding errors: of a sum of inertias, and of a principal or second moment.
+# Largest relative rounding errors: _ROUNDING of a sum of inertias, and _NO_MOMENT of a principal
+# moment of inertia or of a second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
-# Singular values below this fraction of the largest count as zero. Rounding errors are about 1e-15
-# of the largest. The smallest true value is 1e-7 of the largest, for links that are 1e7 m apart.
+# Singular values below this fraction of the largest one count as zero. Relative to the largest one,
+# rounding errors are about 1e-15. The smallest value that is not a rounding error is 1e-7, for
+# links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message names a coordinate if its component of a motion of unit norm exceeds this value.
+# A message about motions without kinetic energy names the coordinates that are involved. A
+# coordinate is involved if its component, in motions of unit norm, exceeds this value.
 _INVOLVED = 0.1
 
-# Largest relative asymmetry of a symmetric body. It results from the rounding of numbers in a URDF.
+# Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
+# rounding of numbers in a URDF.
 _ASYMMETRY = 1e-12
 
 
 def dynamic_parameters(model: pin.Model) -> bytes:
     """Return the mass properties of all bodies as bytes, for a hash of the robot."""
-    return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
+    return np.array([*map(pin.Inertia.toDynamicParameters, model.inertias.tolist())]).tobytes()
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
@@ -72,7 +78,7 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
 
 
 def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
-    """Return the new inertia of a body; `value` is an inertia, or the changes of the old one."""
+    """Return the new inertia of a body; `value` is an inertia, or {property: new value}."""
     of = f"of '{name}'"
     if isinstance(value, pin.Inertia):
         value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
@@ -112,7 +118,8 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
         drawn = draw.uniform(-1.0, 1.0, (1, 7))
         if any(spreads.values()):
             body = model.inertias[index]
-            # Root mean square distance [m] of the body's mass from its centre, along each axis.
+            # `radii` (3,) [m] are the root mean square distances of the body's mass from the centre
+            # of mass, along each axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
             density, com = spreads["mass"] * drawn[:, 0], spreads["com"] * drawn[:, 1:4] * radii
@@ -125,16 +132,18 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
 def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inertia: Array) -> Array:
     """Return the pseudo-inertias (N, 4, 4) of N variants of a body.
 
-    `density` (N,) is a relative change of density, and `inertia` (N, 3) of the second moments about
-    the centre of mass. `com` (N, 3) [m] shifts the centre of mass, and changes neither the mass nor
-    the inertia about the centre. Both `inertia` and `com` are along the columns of `axes` (3, 3).
+    `density` (N,) is the relative change of density. `inertia` (N, 3) is the relative change of the
+    second moments per unit mass about the centre of mass. `com` (N, 3) [m] shifts the centre of
+    mass, and changes neither the mass nor the inertia about the centre of mass. The components of
+    `inertia` and `com` are along the columns of `axes` (3, 3).
     """
-    # Some files contain physically impossible bodies. These are scaled equally along all axes.
+    # Some files contain physically impossible bodies, which have a negative second moment. Scale
+    # such a body equally along all axes, so that the signs of its principal moments do not change.
     least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
     if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
         inertia = inertia[:, :1] * np.ones(3)
-    # An affine map T of the mass distribution changes P to T P T^T. If P is positive definite, the
-    # product is too. T stretches the body about its centre of mass, and then shifts it.
+    # If the affine map T is applied to the mass distribution, P becomes T P T^T, which is positive
+    # semidefinite if P is. Here, T stretches the body about its centre of mass, then shifts it.
     T = np.zeros((len(com), 4, 4))
     T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
     T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever
@@ -144,7 +153,10 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
 
 
 def properties(P: Array) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres of mass (N, 3) and inertias about them, from P (N, 4, 4)."""
+    """Return masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about these centres.
+
+    P (N, 4, 4) contains the pseudo-inertias.
+    """
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
     second = P[:, :3, :3] - mass[:, None, None] * com[:, :, None] * com[:, None]
@@ -153,7 +165,7 @@ def properties(P: Array) -> tuple[Array, Array, Array]:
 
 
 class LinkMass(NamedTuple):
-    """Mass [kg] of a link, and inertia (3, 3) [kg m^2] about the centre of mass."""
+    """Mass [kg] of a link, and its inertia (3, 3) [kg m^2] about the centre of mass."""
 
     mass: float
     inertia: Array
@@ -166,7 +178,7 @@ def link_mass(body: pin.Inertia) -> LinkMass:
 
 
 class Piece(NamedTuple):
-    """Mass properties of a link or of a whole body, and the joint that moves it."""
+    """Mass properties of a link, or of a body of links that are fixed to each other."""
 
     joint: int
     placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
@@ -178,10 +190,12 @@ class Piece(NamedTuple):
 
 
 def pieces_of(robot: Robot) -> dict[str, Piece]:
-    """Return {name: piece} for all links, and for all bodies that have no link or several links.
+    """Return the links and bodies of a robot as {name: piece}.
 
-    For a body of one link, the piece has the name of the link. If the links of a body do not add up
-    to the body, only the body is a piece.
+    - Each link with mass is a piece.
+    - A body is also a piece, except that a body of one link is the same piece as this link.
+    - If the inertias of a body's links do not add up to the inertia of the body, the links are not
+      pieces.
     """
     model, found = robot._bare.model, dict[str, Piece]()
     bodies = ["base" if joint == ROOT else name for joint, name in enumerate(model.names)]
@@ -201,7 +215,8 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
         if difference <= _ROUNDING * np.abs(inertia.matrix()).max():
             found |= named
         found.setdefault(next(iter(named)) if len(named) == 1 else bodies[joint], whole)
-    # Wheels are inserted between the joints, so a joint has another index than in the bare model.
+    # Wheels and modes are inserted between the joints. Therefore a joint may have another index in
+    # the robot's model than in the bare model.
     now = [robot.model.getJointId(name) for name in model.names]
     now[ROOT] = ROOT
     return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
@@ -212,28 +227,28 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
-    sums = sums_of(pieces)
-    names = [*(name for name in pieces if name not in sums), *link_of]
+    names = [*filterfalse(robot.sums.__contains__, pieces), *link_of]
     found = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+    return list(dict.fromkeys(map(link_of.get, found, found)))
 
 
-def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
-    """Return the names of pieces that are the sum of other pieces: bodies of several links."""
-    linked = {each.joint for each in pieces.values() if not each.whole}
-    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
+def sums_of(robot: Robot) -> set[str]:
+    """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
+    linked = {each.joint for each in robot.pieces.values() if not each.whole}
+    return {name for name, each in robot.pieces.items() if each.whole and each.joint in linked}
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
-    """Return a piece as an inertia in its joint's frame."""
+    """Return the spatial inertia of a piece in the frame of its joint."""
     return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
 
 
 def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
     """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one link.
 
-    `mass` (N,) is a relative change of mass, which keeps the inertia about the centre of mass. The
-    other arguments are as in `_stretched`; `inertia` and `com` are along the axes of the link.
+    `mass` (N,) is the relative change of the link's mass without a change of the inertia about its
+    centre of mass. For the other arguments, see `_stretched`: `inertia` and `com` are along the
+    axes of the link.
     """
     body = as_inertia(piece)
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
@@ -243,25 +258,26 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    """Return the coordinates of motions without kinetic energy; usually an empty tuple."""
+    """Return the names of the coordinates that can move without kinetic energy; usually none."""
     # A motion has no kinetic energy if it moves no centre of mass, rotates no body about an axis
-    # with inertia, and moves no joint with armature. The test uses only which masses and moments
-    # are zero. It does not use their values, because rounding errors could hide such a motion.
+    # with inertia, and moves no joint with armature. The test asks only whether a mass or moment is
+    # zero. It does not use the value, because rounding errors could then hide such a motion.
     bodies = robot.model.inertias.tolist()[ROOT:]
-    moments = [np.linalg.eigh(body.inertia) for body in bodies]
-    if all(
-        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
-        for body, (values, _) in zip(bodies, moments, strict=True)
-    ):
+    masses = np.array([*map(attrgetter("mass"), bodies)])
+    values, axes = np.linalg.eigh([*map(attrgetter("inertia"), bodies)])
+    if (masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all():
         return ()
-    # The independent rates nu determine v = columns @ nu, since mimic joints follow their leaders.
+    moments = [*zip(values, axes, strict=True)]
+    # Mimic joints follow their leaders. Therefore v = columns @ nu, where nu is the velocity of the
+    # base and of the independent joints.
     columns = np.eye(robot.nv)
     for joint, leader, multiplier, _ in robot.followers:
         columns[joint.idx_v, leader.idx_v] = multiplier
     columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
-    # If M is singular at two random configurations, it is almost surely singular at all of them.
+    # If M is singular at two random configurations, it is almost surely singular at every
+    # configuration.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -281,7 +297,7 @@ def coordinate_names(robot: Robot) -> list[str]:
 
 
 def massless_note(robot: Robot) -> str:
-    """Return the message about coordinates that can move without moving mass."""
+    """Return the message about coordinates that can move without kinetic energy."""
     idle = listed(robot.idle_coordinates)
     return (
         f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
@@ -290,13 +306,21 @@ def massless_note(robot: Robot) -> str:
 
 
 def require_inertia(robot: Robot) -> None:
-    """Raise `SingularInertiaError` if M is always singular; a factorisation may not detect it."""
+    """Raise `SingularInertiaError` if M is singular at every configuration.
+
+    A factorisation of M may not detect this singularity, because of rounding errors.
+    """
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the matrix (k, nv) that maps v to the velocities in the kinetic energy."""
+    """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
+
+    These are the rates of joints with armature, the velocities of centres of mass, and the angular
+    velocities about principal axes with inertia. `moments` contains the eigenvalues and
+    eigenvectors of each inertia.
+    """
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)
     rows = [np.eye(model.nv)[model.armature > 0.0]]
@@ -311,10 +335,10 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
 
 
 def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of rotors: joints of a body that is symmetric about the joint axis.
+    """Return the names of the rotors: joints whose body is symmetric about the joint axis.
 
-    A rotor carries and leads no other joint, and has no spring. It carries no frame of an input or
-    an output.
+    A rotor carries no other joint, is not the leader of a mimic joint, and has no spring. No input
+    or output is mounted on its body.
     """
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}

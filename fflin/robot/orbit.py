@@ -1,4 +1,4 @@
-"""Circular orbits, with the rotating frame in which a robot is described."""
+"""Circular orbits, with the rotating orbital frame in which the motion of a robot is described."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import instance, number, positive
 
-# Gravitational parameter [m^3/s^2] and equatorial radius [m] of a body: WGS 84 for the earth, JPL
-# ephemerides and IAU 2015 for the other bodies.
+# Gravitational parameter [m^3/s^2] and equatorial radius [m] of each body. The source for the earth
+# is WGS 84. For the other bodies, the sources are the JPL ephemerides (parameters) and IAU 2015
+# (radii).
 BODIES = {
     "earth": (3.986004418e14, 6378137.0),
     "moon": (4.902800118e12, 1737400.0),
@@ -24,7 +25,7 @@ BODIES = {
     "saturn": (3.793120749e16, 60268000.0),
 }
 
-# An altitude [m] over the earth below this value was probably meant in km.
+# If an altitude over the earth is below this value [m], it was probably given in km.
 _LOWEST = 80e3
 
 _FOLLOWS: Any = None  # default of fields that follow from other fields
@@ -120,8 +121,8 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Do not warn if `mu` is given. The orbit then comes from a file, or "earth" is the name
-            # of another body.
+            # Do not warn if `mu` is given. In this case, the orbit was read from a saved file, or
+            # "earth" is the user's name for another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
                 said = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
                 said += "; altitudes are in metres, so write 400 km as 400e3"
@@ -161,7 +162,7 @@ class CircularOrbit:
 
 
 def checked_orbit(value: object) -> CircularOrbit | None:
-    """Return an orbit given as an orbit, an altitude [m] or a mapping; return None for None."""
+    """Convert an orbit, an altitude [m] or a mapping of parameters to an orbit; None stays None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

@@ -1,6 +1,6 @@
-"""Outputs y of the linear model: measured quantities of a robot, in any mix and order.
+"""Outputs y of the linear model: measured quantities of a robot, in any combination and order.
 
-Reference axes are the axes of the state's reference placement. The module
+Reference axes are the axes of the reference placement, to which the state is relative. The module
 `fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
@@ -16,7 +16,7 @@ class Output:
 
     # Name on the command line.
     WORD: ClassVar[str]
-    # (name, unit) of each measured vector (3,); empty if the output consists of states.
+    # (name, unit) of each measured vector (3,); empty if the components of the output are states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
     # Whether the output depends on accelerations, and therefore on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
@@ -28,7 +28,7 @@ class Output:
 
     @property
     def signals(self) -> list[tuple[str, str]]:
-        """(name, unit) of each component of the output; empty if the output consists of states."""
+        """List with (name, unit) of each component; empty if the components are states."""
         prefix = "/".join(self.frames) + "." * bool(self.frames)
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
@@ -70,12 +70,12 @@ class BasePose(Output):
 
 @dataclass(frozen=True)
 class JointOutput(Output):
-    """Base class of outputs of chosen joints, or by default of all joints."""
+    """Base class of joint outputs, for chosen joints or by default for all joints."""
 
     joints: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        # A string is refused because it would be taken as a sequence of one-letter names.
+        # Refuse a string, because it would be read as a sequence of names with one letter each.
         if isinstance(self.joints, str):
             given = repr(self.joints)
             raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
@@ -278,7 +278,7 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Parse an output from the command line: WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
+    """Parse outputs from a text such as WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     require_known("output", [word], kinds)

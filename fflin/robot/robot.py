@@ -1,4 +1,4 @@
-"""Robot: a free-flyer root joint and n joints with one degree of freedom."""
+"""Robot: a free-flyer root joint and n joints with one degree of freedom each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) on joints with positions q_m (.., n) and rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers at joint positions and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -241,7 +241,8 @@ class Robot(Coordinates):
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
         checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
-        # With `merged`, joints that are not named keep their values. Otherwise, only modes do.
+        # If `merged`, all entries that are not named keep their values. Otherwise, only the entries
+        # of modes do.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
             if key in checked:
@@ -337,7 +338,8 @@ class Robot(Coordinates):
         changed: Robot = equipped(self, other)
         if not self.modes:
             return changed
-        # Keep the joints of the modes, so that the modal amplitudes keep their meaning in q.
+        # `changed` has new joints for the modes. Use the old joints instead, so that the modal
+        # amplitudes in q have the same meaning as before.
         model, own = self.model.copy(), self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
@@ -348,6 +350,7 @@ class Robot(Coordinates):
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
     pieces = cached_property(mass_properties.pieces_of)
+    sums = cached_property(mass_properties.sums_of)
 
     @cached_property
     def link_of(self) -> dict[str, str]:
@@ -380,13 +383,15 @@ class Robot(Coordinates):
     @cached_property
     def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) of all joints in state order."""
-        given = (self.stiffness, self.damping, self.rest)
-        return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
+        rows = np.zeros((3, self.n))
+        for row, given in zip(rows, (self.stiffness, self.damping, self.rest), strict=True):
+            row[:] = [given.get(name, 0.0) for name in self.joint_names]
+        return Springs(*rows)
 
     @cached_property
     def mass(self) -> float:
         """Total mass [kg]."""
-        return float(sum(inertia.mass for inertia in self.model.inertias.tolist()[ROOT:]))
+        return float(pin.computeTotalMass(self.model))
 
     def __repr__(self) -> str:
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
@@ -422,5 +427,5 @@ class Robot(Coordinates):
 
     @property
     def _bare(self) -> Robot:
-        """The robot without joints of wheels and modes; the robot itself if it has none."""
+        """The robot without the joints of wheels and modes; `self` if it has no such joints."""
         return self._unequipped or self

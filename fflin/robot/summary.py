@@ -23,12 +23,13 @@ _LOOKS = {
     "thruster": re.compile(r"(?<![a-z])(thr|thruster|nozzle|rcs)(?![a-z])", re.IGNORECASE),
 }
 
-# Frequency [rad/s] and damping ratio that a draft suggests for joints without a motor.
+# Frequency [rad/s] and damping ratio of the springs and dampers that a draft suggests for joints
+# without a motor.
 _SWING, _DAMPED = math.pi, 0.01
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:
-    """Return text about a robot's tree, masses and limits; `at_point` follows the first lines."""
+    """Return text about a robot's tree, masses and limits; `at_point` follows the heading."""
     modes = {joint.name for joint in robot.modes}
     inputs = sum(len(names) for _, names in robot.named_inputs)
     counts = [
@@ -54,7 +55,11 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
 
 
 def _tree(robot: Robot) -> list[list[str]]:
-    """Return a table with a row for each body except modes, indented by depth in the tree."""
+    """Return the rows of a table: the base, then the joints except modes in the order of the tree.
+
+    The name of a joint is indented by its depth in the tree. The masses of modes are added to their
+    carriers.
+    """
     model = robot.model
     masses = [body.mass for body in model.inertias.tolist()]
     for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
@@ -82,7 +87,7 @@ def _tree(robot: Robot) -> list[list[str]]:
 
 
 def _settings(robot: Robot) -> list[str]:
-    """Return lines about the robot's settings that are not in the URDF; skip inputs and orbit."""
+    """Return lines about the fields that a URDF does not contain, except inputs and orbit."""
     outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
     shown: dict[str, object] = {
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
@@ -117,7 +122,7 @@ def _indented(text: str, below: str) -> str:
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the draft of a robot file for a robot from a URDF; `urdf` is the path to write."""
+    """Return the draft of a robot file; `urdf` is the path of the URDF in the draft."""
     model = robot.model
     idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
     names = ", ".join(_text(joint.name) for joint in idle)
@@ -158,7 +163,11 @@ def draft(robot: Robot, urdf: str) -> str:
 
 
 def _candidates(robot: Robot) -> tuple[str, list[str]]:
-    """Return the inputs that the names of links suggest, as TOML comments, and likely wheels."""
+    """Return suggested inputs as TOML text, and the names of joints that are probably wheels.
+
+    The inputs follow from the names of links, and are comments in the text. The names of joints are
+    TOML strings.
+    """
     model, data = robot.model, robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())
     text, spun = "", []
@@ -175,7 +184,7 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
         axis, lines, lock = np.array([0.0, 0.0, 1.0]), ["max = 1.0  # [N]"], ""
         name, key = _text(frame.name), "direction"
         if kind == "reaction_wheel":
-            # The wheel's name must differ from the names of joints and frames.
+            # The name of a wheel must differ from the names of all joints and frames.
             name, key, lines = _text(f"{frame.name}_rotor"), "axis", ["max = 1.0  # [N m]"]
             joint = model.joints[frame.parentJoint]
             if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:

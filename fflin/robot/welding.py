@@ -1,4 +1,4 @@
-"""Weld joints at given values, or weld the base of one robot to a frame of another robot."""
+"""Functions that weld joints at given positions, or the base of a robot to another robot."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def welded(robot: Robot, lock: Lock) -> Robot:
-    """Return a robot with joints and wheels welded; `lock` gives the values of the joints."""
+    """Return a robot with joints and wheels welded; `lock` gives their names and positions."""
     bare, asked = robot._bare, requested(lock)
     wheels = {name for name in asked if name in robot.wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}
@@ -84,7 +84,7 @@ def locked_model(
 
 
 def requested(lock: object) -> dict[str, float | None]:
-    """Return locks as {joint or pattern: value}; the value None means the neutral position."""
+    """Return locks as {joint or pattern: position}; None stands for the neutral position."""
     lock = () if lock is None else lock
     try:
         names: list[object] = [lock] if isinstance(lock, str) else [*cast("Iterable[object]", lock)]
@@ -96,9 +96,10 @@ def requested(lock: object) -> dict[str, float | None]:
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
-    """Return a model with joints welded at q (nq,)."""
+    """Return a model in which the joints with the given indices are welded at q (nq,)."""
     model, names = with_marked_frames(model)
-    # Models built in code may lack a joint's frame, without which Pinocchio crashes.
+    # A model that was built in code may lack the frame of a joint. Without this frame,
+    # `buildReducedModel` crashes.
     for index in indices:
         if not model.existFrame(model.names[index], pin.FrameType.JOINT):
             model.addJointFrame(index)
@@ -108,9 +109,9 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
 
 
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
-    """Return a robot with another robot's base welded to a frame.
+    """Return a robot with the base of another robot welded to a frame.
 
-    The names of the other robot change to PREFIX.NAME, and its joints have no motors.
+    The joints and frames of the other robot get the names PREFIX.NAME. No inputs act on its joints.
     """
     bare = robot._bare
     if not prefix or "." in prefix:
@@ -150,7 +151,8 @@ def _appended(
 ) -> pin.Model:
     """Return a model with another model welded to a frame.
 
-    The joints of the other model come after all joints that the body of the frame carries.
+    The joints of the other model come after all joints that the body with the frame already
+    carries.
     """
     joint, at = find_frame(model, frame)
     other = other.copy()

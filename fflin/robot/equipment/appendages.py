@@ -1,15 +1,16 @@
 r"""Flexible appendages and slosh of a link, modelled as bodies on passive joints.
 
 An appendage with the rigid inertia :math:`M_{rr}` is clamped to a frame that moves with the twist
-V. Its k modes have the amplitudes :math:`\eta`, unit modal mass and the participation L (6, k). The
-kinetic energy of the appendage is
+V. The appendage has k modes with the amplitudes :math:`\eta`, unit modal mass and the modal
+participation L (6, k). Its kinetic energy is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is equivalent to one ball on one screw joint. The ball has the spatial inertia ``I``, and
-moves by the twist ``S`` per unit amplitude. For the mode's column ``l`` of L, these satisfy
-``I S = l`` and ``S^T I S = 1``. The ball is subtracted from the link's inertia, so that the link
-and the ball together have the inertia in the URDF.
+Each mode is modelled by a ball on a screw joint (16.4). The ball is a rigid body with the spatial
+inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its momentum ``I S`` is the mode's
+column of L. The modal mass, which is 1, consists of ``S^T I S``, and of a negative rotor inertia of
+the joint if the ball is lighter than in (16.4). The inertia of the ball is subtracted from the
+inertia of the link. Therefore the link and its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First root of J_1'(x) = 0. For the first lateral mode in a circular cylinder, this is the
-# wavenumber times the radius of the cylinder.
+# First positive root of J_1'(x) = 0 with the Bessel function J_1. The first lateral mode in a
+# circular cylinder has the wavenumber x / radius.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -83,8 +84,8 @@ class FlexibleAppendage(FrozenArrays):
     rotation: Any
     damping: Any = 0.005
     name: str | None = None
-    # Rigid inertia M_rr (6, 6) from a file, about the frame's origin; translation is before
-    # rotation. `rigid` is true if this inertia replaces the inertia of the URDF.
+    # Rigid inertia M_rr (6, 6) from a file, about the frame's origin, with translation before
+    # rotation. If `rigid` is true, this inertia replaces the inertia in the URDF.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -439,8 +440,9 @@ Appendage: TypeAlias = FlexibleAppendage | Slosh
 
 
 def rigid_inertia(M: Array) -> pin.Inertia:
-    """Convert a rigid-body mass matrix (6, 6) to an inertia; translation is before rotation."""
-    # Pinocchio's parameters: mass, first moments, and moments of inertia xx, xy, yy, xz, yz, zz.
+    """Convert a rigid-body mass matrix (6, 6), with translation before rotation, to an inertia."""
+    # Pinocchio's parameters are the mass, the three first moments, and the moments of inertia in
+    # the order xx, xy, yy, xz, yz, zz.
     entries = M[[0, 1, 2, 0, 3, 3, 4, 3, 4, 5], [0, 5, 3, 4, 3, 4, 4, 5, 5, 5]]
     return pin.Inertia.FromDynamicParameters(entries)
 

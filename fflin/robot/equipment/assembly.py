@@ -1,9 +1,11 @@
-r"""A robot's equipment: reaction wheels, flexible appendages and slosh, as joints of its model.
+r"""Equipment of a robot: reaction wheels, flexible appendages and slosh, as joints of its model.
 
-Each mode of a flexible appendage is equivalent to one ball on one screw joint. The ball has the
-spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. For the participation ``l``
-(6,) of the mode, these satisfy ``I S = l`` and ``S^T I S = 1``. The ball is subtracted from the
-link's inertia, so that the link and the ball together have the inertia in the URDF.
+Each mode of a flexible appendage is modelled by a ball on a screw joint (16.4). The ball is a rigid
+body with the spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its momentum
+``I S`` is the mode's column of the modal participation L (6, k). The modal mass, which is 1,
+consists of ``S^T I S``, and of a negative rotor inertia of the joint if the ball is lighter than in
+(16.4). The inertia of the ball is subtracted from the inertia of the link. Therefore the link and
+its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -32,21 +34,25 @@ if TYPE_CHECKING:
 # Rounding errors can make an eigenvalue of M_rr - L L^T negative. A negative eigenvalue is accepted
 # if its magnitude is at most this fraction of the largest eigenvalue of M_rr.
 _NEGATIVE = 1e-9
-# Largest relative difference between the inertias of a file and of the URDF without a warning.
+# A warning is issued if the inertia in an appendage's file differs from the inertia in the URDF by
+# more than this fraction.
 _AGREE = 1e-2
 # Largest total mass of the balls on a body, as a fraction of the body's mass. The remaining mass
-# must be positive, because CRBA adds inertias from the tips to the base, and each sum needs a mass.
+# must be positive, because CRBA adds inertias from the tips of the tree to the base, and each sum
+# must have a positive mass.
 _LARGEST_SHARE = 0.9
-# A ball's displacement counts as a rotation about its appendage's frame if their distance is at
-# least this fraction of the body's radius of gyration.
+# If the distance of a ball from the frame of its appendage is at least this fraction of the body's
+# radius of gyration, the displacement of the ball counts as a rotation about the frame.
 _SHORTEST = 0.05
-# Least mass of a ball, as a fraction of the mass with which its joint needs no rotor inertia.
+# Least mass of a ball, as a fraction of the mass (16.4) that requires no rotor inertia.
 _LIGHTEST = 1e-6
-# The translation part of a participation counts as zero if it is below this fraction of the
-# rotation part, and vice versa.
+# The translation part of a participation counts as zero if it is at most this fraction of the
+# rotation part, and vice versa. For this comparison, the translation part is multiplied by a length
+# of the body.
 _NONE = 1e-14
 
-# Fields of a robot whose keys name joints, and the groups of names that these keys may contain.
+# Fields of a robot that have joint names as keys. A key may also be GROUP.JOINT, with a group of
+# _GROUPS.
 _BY_NAME = (
     *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
     *("point", "target", "start"),
@@ -61,11 +67,11 @@ def equipped(
     inputs: object = None,
     appendages: Sequence[Appendage] | None = None,
 ) -> Robot:
-    """Return a robot with other inputs, other appendages, or another robot without equipment.
+    """Return a robot with new inputs, new appendages or a new bare robot.
 
-    `bare` is the robot without wheels and modes. Arguments that are not given keep their values.
-    Modes become joints, and wheels that have an inertia do too. Entries of joints that no longer
-    exist are removed from the fields.
+    The bare robot is the robot without the joints of wheels and modes. If an argument is omitted,
+    the robot keeps the old value. Each mode becomes a joint, and so does each wheel with an
+    inertia. If a joint no longer exists, its entries are removed from fields such as `stiffness`.
     """
     before, bare = robot._bare, bare or robot._bare
     checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
@@ -91,13 +97,14 @@ def equipped(
     gone = [name for name in robot.joint_names if name not in names]
     fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
     modes = {joint.name for joint in robot.modes}
-    # Only new appendages reset the springs of modes, because a user may have changed the springs.
+    # Reset the springs of the modes only if appendages are given. Otherwise keep them, because the
+    # user may have changed them.
     for name in ("stiffness", "damping") if appendages is not None else ():
         of_joints = fields.get(name, getattr(robot, name))
         fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
         for item in items:
             fields[name] |= item.springs[name]
-    # Remember only the names of wheels and modes. Other joints that are gone have been locked.
+    # Remember only the names of removed wheels and modes. All other removed joints were locked.
     removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
     return replace(
         robot,
@@ -111,7 +118,7 @@ def equipped(
 
 
 def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
-    """Return a mapping without keys that match only removed joints, also in nested mappings."""
+    """Return a mapping, and all mappings in it, without the keys that match only removed joints."""
     removed, others = ([f"{of}.{x}" for of in _GROUPS for x in names] for names in (gone, left))
     return {
         key: _without(value, gone, left) if isinstance(value, Mapping) else value
@@ -121,7 +128,7 @@ def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict
 
 
 def with_appendages(robot: Robot, appendages: object) -> Robot:
-    """Return a robot with other appendages (flexible or slosh), whose modes become joints."""
+    """Return a robot with new appendages (flexible or slosh), whose modes become joints."""
     given = [appendages] if isinstance(appendages, Appendage) else appendages
     if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
         raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
@@ -129,7 +136,8 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     for item in given:
         if not isinstance(item, FlexibleAppendage) or item.inertia is None:
             continue
-        # The link at the frame, or the whole body if the frame is not a link.
+        # The file's inertia is compared with the link at the frame, or with the whole body if the
+        # frame is not a link.
         joint, placement = find_frame(bare.model, item.frame)
         body, what = bare.model.inertias[joint], f"the body with frame '{item.frame}'"
         of_file, own, links = rigid_inertia(item.inertia), body, bare.links
@@ -158,9 +166,10 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
 class Mounted(NamedTuple):
     """Body that is mounted on a carrier, and the joint between body and carrier.
 
-    `carrier` is the index of a joint of the bare model, or the name of a mounted body. `placement`
-    is the joint's placement in the carrier's frame. `inertia` is the body's inertia in the joint's
-    frame.
+    `carrier` is the index of a joint of the bare model, or the joint name of another mounted body.
+    `placement` is the joint's placement in the carrier's frame. `motion` is the type of the joint.
+    `inertia` is the body's inertia in the joint's frame, and `armature` is the joint's rotor
+    inertia.
     """
 
     joint: Joint
@@ -172,14 +181,15 @@ class Mounted(NamedTuple):
 
 
 def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
-    """Return a model with a new joint for each part; `bodies` replace the old inertias.
+    """Return a model with new joints for `parts`; the old joints get the inertias `bodies`.
 
-    The new joints come after all other joints that their carrier carries.
+    A new joint comes after all joints that its carrier already carries.
     """
     new, names = with_marked_frames(model)
     for part in parts:
         on = part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
-        # A model that was built in code may lack the frame of a joint.
+        # `appendModel` needs the frame of the carrier's joint, but a model that was built in code
+        # may lack it.
         if not new.existFrame(on, pin.FrameType.JOINT):
             new.addJointFrame(new.getJointId(on))
         alone = pin.Model()
@@ -199,10 +209,10 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
 
 
 def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dict[str, str]]:
-    """Return a copy of a model whose frames are renamed to unique marks, and {mark: name}.
+    """Return a copy of a model with unique marks as frame names, and {mark: original name}.
 
-    Joint frames keep their names. When Pinocchio joins or reduces models, it finds frames by name,
-    but a link and a joint may share a name.
+    When Pinocchio joins or reduces models, it finds frames by name, but a link and a joint may
+    share a name. The unique marks prevent errors in this case. Joint frames keep their names.
     """
     marked, names = model.copy(), dict[str, str]()
     for index, frame in enumerate(marked.frames):
@@ -212,7 +222,7 @@ def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dic
 
 
 def restore_names(model: pin.Model, names: Mapping[str, str]) -> None:
-    """Replace the marks of frames by the original names."""
+    """Replace the marks of `with_marked_frames` by the original names of the frames."""
     for frame in model.frames:
         frame.name = names.get(frame.name, frame.name)
 
@@ -234,22 +244,25 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
 
 
 def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
-    """Return the angular momentum in wheels without inertia, summed for each carrying joint.
+    """Return the momentum of all wheels without inertia, as a sum for each joint that carries them.
 
-    Each entry is the index of the joint, and the momentum (3,) [N m s] in the axes of the joint.
+    Each entry is (index of the joint, angular momentum (3,) [N m s] in the axes of the joint).
     """
     stored: dict[int, Array] = {}
-    for _, wheel in named_wheels(robot.inputs):
-        if wheel.momentum:
+    for wheel in robot.inputs:
+        if isinstance(wheel, ReactionWheel) and wheel.momentum:
             joint, axis = carrier(robot.model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
-    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
+    return tuple(zip(stored, map(frozen, stored.values()), strict=True))
 
 
 def _mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return the wheels that have an inertia, and subtract each from the body that carries it."""
+    """Return a mounted body for each wheel with inertia.
+
+    The inertia of the wheel is subtracted from its carrier in `bodies`.
+    """
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
@@ -259,7 +272,8 @@ def _mounted_wheels(
         rest = bodies[joint] - spinning
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # If the link is the wheel itself, the difference of the inertias is only a rounding error.
+        # Also refuse a wheel whose inertia equals the inertia of the link up to rounding errors,
+        # because the link is then the wheel itself.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
@@ -277,21 +291,24 @@ def _mounted_wheels(
 
 
 def _carrier_name(model: pin.Model, joint: int) -> str:
-    """Return the name of the body on a joint, for messages."""
+    """Return the name of a joint's body for messages."""
     return "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
 
 
 def turned_to(axis: Array) -> Array:
-    """Return a rotation (3, 3) that maps z to an axis; it is exact for the axes x, y and z."""
+    """Return a rotation matrix (3, 3) that maps z to an axis.
+
+    The matrix is exact if the axis is x, y or z.
+    """
     beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     beside /= np.linalg.norm(beside)
     return np.column_stack((beside, np.cross(axis, beside), axis))
 
 
 def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
-    """Return an appendage's carrying joint, placement and participation L (6, k).
+    """Return the joint that carries an appendage, the placement, and the participation L (6, k).
 
-    The placement and L are in the frame of the carrying body. L is about the body's origin.
+    The placement and L are in the frame of this joint, and L is about its origin.
     """
     joint, placement = find_frame(model, item.frame)
     return joint, placement, placement.toDualActionMatrix() @ item.participation
@@ -300,7 +317,10 @@ def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
 def _mounted_modes(
     model: pin.Model, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
-    """Return mounted bodies for all modes, and subtract them from the bodies that carry them."""
+    """Return a mounted body for each mode.
+
+    The inertia of this body is subtracted from its carrier in `bodies`.
+    """
     parts = list[Mounted]()
     of_body: dict[int, list[tuple[Appendage, pin.SE3, Array]]] = {}
     for item in appendages:
@@ -347,10 +367,11 @@ def _mounted_modes(
 
 
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
-    """Return {mode: effective masses and moments of inertia (6,)} along the frame's axes.
+    """Return the effective masses and moments of inertia (6,) of each mode, as {mode: values}.
 
-    The values are fractions of the rigid inertia about the origin of the appendage's frame. The
-    rigid inertia is from the appendage's file, or otherwise from the body that carries it.
+    The values are along the axes of the appendage's frame and about its origin. Each value is a
+    fraction of the corresponding mass or moment of the rigid inertia. The rigid inertia is from the
+    file of the appendage. If there is no file, it is the inertia of the carrying body.
     """
     found: dict[str, Array] = {}
     for item in appendages:
@@ -386,17 +407,19 @@ def _compare_inertia(
 
 
 def _radius_of_gyration(body: pin.Inertia) -> float:
-    """Return the root mean square distance [m] of a body's mass from the origin."""
+    """Return the root mean square distance [m] of a body's mass from the origin of its frame."""
     trace = max(float(np.trace(body.matrix()[3:, 3:])), 1e-300)
     return math.sqrt(trace / max(2.0 * body.mass, 1e-300))
 
 
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
-    """Return the least eigenvalue (N,) of M_rr - L L^T over the largest eigenvalue of M_rr.
+    """Return the least eigenvalue (N,) of M_rr - L L^T, divided by the largest eigenvalue of M_rr.
 
-    M_rr follows from masses (N,), centres of mass (N, 3), and inertias (N, 3, 3) about them.
+    M_rr is computed from the masses (N,), the centres of mass (N, 3), and the inertias (N, 3, 3)
+    about these centres.
     """
-    # M_rr is about the centre of mass, with lengths in units of the radius of gyration.
+    # Here, M_rr and the modes are about the centre of mass. The unit of length is the radius of
+    # gyration.
     trace = np.trace(inertia, axis1=1, axis2=2)
     size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
     t, r = np.split(L, 2)
@@ -414,10 +437,10 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
 
 
 def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]) -> int | None:
-    """Return the index of the first row in which modes need more inertia than their body has.
+    """Return the index of the first sample in which a body has too little inertia for its modes.
 
-    `bodies` maps joints of the robot without wheels and modes to masses (N,), centres of mass
-    (N, 3) and inertias (N, 3, 3). The result is None if all N rows are possible.
+    `bodies` maps joint indices of the bare robot to the masses (N,), centres of mass (N, 3) and
+    inertias (N, 3, 3) of N samples. The result is None if all samples are possible.
     """
     found = [_carried(robot._bare.model, item) for item in robot.appendages]
     impossible = []
@@ -431,17 +454,19 @@ def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Arra
 def _ball(
     joint: int, body: pin.Inertia, name: str, column: Array, p: Array, lighter: float = 1.0
 ) -> Mounted:
-    """Return the ball of a mode with the participation `column` (6,) about its body's origin.
+    """Return the ball that models a mode (16.4).
 
-    `p` (3,) is the origin of the appendage's frame. `lighter` is the ball's mass as a fraction of
-    the mass with which its joint needs no rotor inertia.
+    `column` (6,) is the mode's participation about the body's origin. `p` (3,) is the origin of the
+    appendage's frame. `lighter` is the ball's mass as a fraction of the mass (16.4), with which the
+    joint needs no rotor inertia.
     """
-    # Refer the participation to the appendage's frame. Only there, a pure translation has r = 0.
+    # Compute the participation (t, r) about the origin of the appendage's frame. About this point,
+    # a mode that only translates has r = 0.
     t, r, size = column[:3], column[3:] - np.cross(p, column[:3]), _radius_of_gyration(body)
     square, center = float(t @ t), np.zeros(3)
     if math.sqrt(square) * size > _NONE * math.hypot(*r):
         center = np.cross(t, r) / square
-        # The ball's distance from the frame is at most the body's radius of gyration.
+        # Limit the distance of the ball from the frame to the body's radius of gyration.
         center *= min(1.0, size / max(math.hypot(*center), 1e-300))
     else:
         t, square = np.zeros(3), 0.0
@@ -451,9 +476,9 @@ def _ball(
         r, rest = np.zeros(3), 0.0
     moment = rest**2 + size**2 * square if rest else 0.0
     mass = square + (rest / size) ** 2 if square else 0.0
-    # Per unit amplitude, the ball rotates by |w| = rest / moment and moves by |v| = |t| / mass. It
-    # is at the distance `lever` from the appendage's frame. So the structure rotates by at most
-    # |w| + |v| / lever.
+    # Per unit amplitude, the ball rotates by |w| = rest / moment, and its centre moves by
+    # |v| = |t| / mass. The centre is at the distance `lever` from the appendage's frame. Therefore
+    # the structure rotates by at most |w| + |v| / lever.
     rotation = rest / moment if moment else 0.0
     if mass and lever >= _SHORTEST * size:
         rotation += math.sqrt(square) / mass / lever
@@ -467,8 +492,8 @@ def _ball(
     else:
         axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
         origin, motion = center, pin.JointModelPZ()
-    # A lighter ball has S^T I S > 1. A negative rotor inertia restores the modal mass of 1:
-    # S^T I S + rotor = 1.
+    # A ball that is lighter than in (16.4) has S^T I S > 1. A negative rotor inertia restores the
+    # modal mass of 1: S^T I S + rotor = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
@@ -479,8 +504,8 @@ def _ball(
 def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
     """Return a slosh mass as two joints in series; the second joint carries the mass."""
     x, y, z = (placement.rotation @ slosh.axes).T
-    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, so positive
-    # angles also move the mass along x and y.
+    # A mass on springs slides along x and y. A pendulum rotates about -y, then about x, so that
+    # positive angles move its mass in the directions x and y.
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))

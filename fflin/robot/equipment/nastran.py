@@ -20,11 +20,12 @@ MASSES = {
     "slug": 14.593902937206364,
     "lbf s^2/in": 175.12683524647636,
 }  # [kg]
-# Names that different programs give to the mass and stiffness matrices.
+# Names of the mass matrix and of the stiffness matrix in the files of different programs.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest rounding error, relative to the largest entry of a matrix. A file is refused if a larger
-# entry makes a matrix asymmetric, couples boundary and modes, or resists a rigid motion.
+# Largest relative rounding error of a matrix. A file is refused if a larger error makes a matrix
+# asymmetric. It is also refused if a larger stiffness couples the boundary to the modes, or resists
+# a rigid motion.
 _SHARE = 1e-6
 
 
@@ -53,7 +54,8 @@ def read_superelement(
     center = points.mean(axis=0)
     if origin is not None:
         center = vector("origin", origin, 3, "a point") / LENGTHS[length]
-    # Convert rigid motions about the file's basic origin to motions about the interface's origin.
+    # Convert the rigid motions about the file's basic origin to rigid motions about `center`, the
+    # origin of the interface.
     rigid = rigid @ pin.SE3(np.eye(3), center).toActionMatrix()
     inertia = rigid.T @ M[np.ix_(boundary, boundary)] @ rigid
     K_b, coupling = K[np.ix_(boundary, boundary)], K[np.ix_(boundary, inner)]
@@ -98,9 +100,11 @@ def _read_as(path: Path, kind: str) -> Iterator[None]:
 
 
 def _boundary(path: Path) -> tuple[Mask, Array, Array]:
-    """Return the mask and the rigid motions of the degrees of freedom, and the grid positions.
+    """Return the boundary mask, the rigid motions and the grid positions of a superelement.
 
-    The mask is true for the degrees of freedom of the boundary.
+    The mask (m,) is true for the degrees of freedom of the boundary, and false for the modes. The
+    columns of the rigid motions (m, 6) are unit translations and rotations about the basic origin.
+    The positions (grids, 3) are in basic coordinates.
     """
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file() and "pv_only"
     with _read_as(path, "the assembly file (.asm) of an external superelement"):

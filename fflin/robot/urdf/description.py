@@ -15,34 +15,36 @@ from fflin.robot.urdf.xml import Element, decimal, enumerated, named, quoted
 # Degrees of freedom of each joint type.
 FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floating=6)
 
-# Value of a missing limit in the model.
+# Value that stands for a missing limit in the Pinocchio model.
 UNLIMITED = sys.float_info.max
 
-# For a length of 1e8 m, adding 1 m^2 to its square changes nothing in double precision. The moments
-# of inertia of the links would be lost, and ABA would divide zero by zero.
+# Largest coordinate of an <origin>. At 1e8 m, adding 1 m^2 to the square of the length does not
+# change it in double precision. The moments of inertia of links would be lost in such sums, and ABA
+# would divide zero by zero.
 _FARTHEST = 1e7  # [m]
 
-# Tolerance of a quaternion's length, because many files give only four digits.
+# Tolerance of the length of a quaternion. It is large, because many files give only four digits.
 _QUATERNION_SLACK = 1e-3
 
 # An axis whose length is outside these bounds is an error in the file.
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
 # Rounding can change a zero eigenvalue of an inertia to -1e-16 times the largest eigenvalue. The
-# tolerance is larger, because CAD programs write fewer digits.
+# tolerance is larger than 1e-16, because CAD programs write fewer digits.
 _NEGATIVE_SLACK = 1e-9
 
 # CAD programs may give a point mass a small inertia of either sign, which is only a rounding error.
-# Such an inertia is at most mass times the square of this length.
+# A negative inertia counts as such an error if its magnitude is at most the mass times the square
+# of this length.
 _POINT = 1e-6  # [m]
 
-# A negative moment of a link is accepted if its magnitude is at most this fraction of the least
-# moment of the rigid body of all links fixed to it. It then changes M by less than the rounding of
-# published numbers does.
+# A link and all links that are fixed to it form one rigid body. A negative principal moment of the
+# link is accepted if its magnitude is at most this fraction of the body's least principal moment.
+# It then changes M by less than the rounding of published numbers does.
 _LOST_IN_BODY = 1e-6
 
-# Relative tolerance by which a principal moment may exceed the sum of the other two. Both are equal
-# for a flat plate, and published numbers may have only three digits.
+# Relative tolerance by which a principal moment may exceed the sum of the other two. For a flat
+# plate, the moment is equal to this sum, and published numbers may have only three digits.
 TRIANGLE_SLACK = 1e-3
 
 # urdfdom and Pinocchio's parser recurse along the tree, and take about 2.5 kB of stack per link.
@@ -51,12 +53,12 @@ _DEPTH_LIMIT = 1_000
 # Most robots have fewer than 100 links. The limit bounds computing time and memory.
 _LINK_LIMIT = 10_000
 
-# Attributes of <inertia>: the entries of the upper triangle, row by row.
+# Attributes of <inertia>, which are the entries of the upper triangle of the matrix, row by row.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Pose(NamedTuple):
-    """Placement of a frame in another frame, as in the file."""
+    """Placement of a frame in another frame, in the form in which the file gives it."""
 
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
     rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]
@@ -128,7 +130,7 @@ def read_link(name: str, element: Element) -> Link:
 
 
 def read_pose(element: Element) -> Pose:
-    """Read the <origin> of an element; return the identity if the element has none."""
+    """Read the <origin> of an element; return the identity if the element has no <origin>."""
     origin = element.find("origin", "xyz", "rpy", "quat_xyzw")
     if origin is None:
         return Pose()
@@ -165,7 +167,8 @@ def read_joint(name: str, element: Element) -> JointElement:
         numbers = found.number("multiplier", 1.0), found.number("offset", 0.0)
         mimic = Mimic(found.text("joint"), *numbers)
     joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
-    # Only a joint with one degree of freedom needs an axis. Exporters write zeros for others.
+    # Only a joint with one degree of freedom needs an axis. For all other joints, exporters may
+    # write an axis of zeros, so do not check it.
     if FREEDOM[kind] != 1:
         return joint
     if found := element.find("axis", "xyz"):
@@ -189,7 +192,10 @@ def read_joint(name: str, element: Element) -> JointElement:
 
 
 def _limits(found: Element) -> dict[str, float]:
-    """Return the valid limits; an invalid one causes only a note, because A and B ignore limits."""
+    """Return the limits of a <limit>; an invalid limit becomes infinite.
+
+    An invalid limit causes only a note, because A and B do not depend on limits.
+    """
     limits: dict[str, float] = {}
     for name in (x for x in ("lower", "upper", "effort", "velocity") if x in found.attributes):
         value = decimal(found.attributes[name].strip())
@@ -244,12 +250,12 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
 
 
 def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
-    """Check the elements of a URDF, and return its links and its joints in the file's order."""
+    """Check the elements of a URDF; return its links and joints by name, in the file's order."""
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     root.refuse_near_miss("link", "joint")
-    # Extensions of URDF have elements with the same names but other children. So a misplaced link
-    # or joint is recognised by its children.
+    # Find links and joints that are in the wrong place. Recognise them by their children, because
+    # extensions of URDF may use the same tags for elements with other children.
     marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
     for child in root.children:
         for inner in (child, *child.iterate()):
@@ -330,17 +336,19 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
     """Return whether a principal moment [kg m^2] is too negative to be a rounding error.
 
-    The moments are sorted.
+    `moments` are sorted in increasing order.
     """
-    # A body within the radius r of its centre has moments of at most mass * r^2.
+    # A body whose mass is within the radius r of its centre has moments of at most mass * r^2.
+    # A negative moment is a rounding error of a point mass if its magnitude is at most this bound
+    # with r = _POINT.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
     """Return notes about unusual inertias.
 
-    Raise `UrdfError` for a negative principal moment, unless it is negligible compared with the
-    moments of the rigid body that contains the link.
+    Raise `UrdfError` for a negative principal moment of a link, unless the moment is a rounding
+    error, or negligible compared with the moments of the rigid body that contains the link.
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
@@ -361,7 +369,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
-        # The largest principal moment exceeds the sum of the other two.
+        # The largest principal moment of these links exceeds the sum of the other two.
         (unequal, f"unphysical inertia: {enumerated(unequal)}"),
         (weightless, f"inertia without mass: {named('link', weightless)}"),
     )

@@ -27,14 +27,14 @@ _STACK = 16 * 2**20
 
 _UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
 
-# Characters that must be escaped in values of attributes.
+# Characters that must be escaped in the values of XML attributes.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
-# Time limit [s] of an expansion, because expressions and macros in xacro may never end.
+# Time limit [s] for the expansion of a xacro file, whose expressions and macros may never end.
 XACRO_LIMIT = 60.0
 
-# Path of the program that expands xacro. It is run as a file, because with -m or -c it could import
-# modules from the working folder.
+# Path of the program that expands xacro. Python runs it as a file: with the option -m or -c, the
+# program could import modules from the working folder.
 _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
 # These elements do not affect the model, so a "${" inside them does not require xacro.
@@ -57,12 +57,13 @@ class Urdf(NamedTuple):
 
 
 def describe(document: bytes, path: Path) -> Urdf:
-    """Read a URDF from the bytes of a file; `path` is its name in errors."""
+    """Read a URDF or xacro file; `document` contains the bytes of the file at `path`."""
     root, notes = plain_root(document, path)
     links, joints = description.read_tree(root)
     mimics = description.resolve_mimics(joints)
-    # A continuous joint does not count full turns, but a revolute joint does. A leader must count
-    # them if its full turn displaces a mimic joint.
+    # The position of a continuous joint does not count full turns, but the position of a revolute
+    # joint does. If a full turn of a continuous leader displaces its mimic joint, make the leader a
+    # revolute joint without limits.
     for name, (leader, multiplier, _) in mimics.items():
         turning = joints[leader].type == "continuous"
         if turning and not (joints[name].type == "continuous" and multiplier.is_integer()):
@@ -92,7 +93,7 @@ def describe(document: bytes, path: Path) -> Urdf:
             "joints with unusual names"
         )
     model.gravity.setZero()
-    # File names may contain bytes that are not valid text.
+    # File names may contain bytes that are not valid text. Escape these bytes.
     model.name = name or path.stem.encode(errors="backslashreplace").decode()
     notes += [*notes_of(root), *description.inertia_notes(links.values(), model, path.stem)]
     meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
@@ -101,9 +102,10 @@ def describe(document: bytes, path: Path) -> Urdf:
 
 
 def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
-    """Parse a document, expanding any xacro in it; return its root and the messages of xacro."""
+    """Parse a document, and expand it if it uses xacro; return its root and xacro's messages."""
     root = parse(document, str(path))
-    # Search first for text that may indicate xacro, or for "&#", which may encode such text.
+    # To save time, search the elements for xacro only if the document contains text that may belong
+    # to xacro, or "&#", which may encode such text.
     text = document.replace(b"\0", b"")  # so that UTF-16 is searched too
     suspect = any(x in text for x in (b"xacro:", b"$", b"&#"))
     elements = chain([root], root.iterate(_IGNORED)) if suspect else ()
@@ -115,7 +117,7 @@ def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
 
 
 def _uses_xacro(element: Element) -> bool:
-    # A declaration of the prefix xacro is an attribute, and does not use xacro.
+    # The attribute xmlns:xacro only declares the prefix, and does not count as a use of xacro.
     return element.tag.startswith("xacro:") or any(
         "${" in value or "$(" in value for value in element.attributes.values()
     )
@@ -124,9 +126,11 @@ def _uses_xacro(element: Element) -> bool:
 def ignored(
     joints: Mapping[str, JointElement], origin: str
 ) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """Yield (field, joints, warning) for damping, friction and zero limits that fflin ignores.
+    """Yield a warning (field, joints, text) for each property of joints that fflin ignores.
 
-    The warning is unnecessary if this field of the robot names all of these joints.
+    The properties are damping, friction, and zero limits of effort or velocity. The warning is
+    unnecessary if the robot has a field of this name that contains all of these joints. A robot has
+    the fields "damping" and "passive", but no field "friction".
     """
     moving = [joint for joint in joints.values() if joint.freedom]
     for field, effect in (("damping", "damping"), ("friction", "Coulomb friction")):
@@ -144,7 +148,7 @@ def ignored(
 
 
 def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]) -> str:
-    """Return a URDF of links and joints, with numbers in full precision."""
+    """Return the text of a URDF with given links and joints, and with numbers in full precision."""
     parts = []
     for link in links.values():
         inertial = ""
@@ -162,7 +166,8 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
         if kind in ("revolute", "prismatic") or joint.limits:
             inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
         parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
-    # urdfdom reads quat_xyzw only from version 1.1 on, and version 1.2 would require limits.
+    # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. From version 1.2 on,
+    # it would require limits.
     return _tag("robot", {"name": name, "version": "1.1"}, "\n".join(parts))
 
 
@@ -172,7 +177,10 @@ def _origin(pose: Pose) -> str:
 
 
 def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:
-    """Return an XML element; the functions of the standard library would load many modules."""
+    """Return the text of an XML element.
+
+    The XML writers of the standard library are not used, because they would load many modules.
+    """
     text = f"<{tag}"
     for name, value in attributes.items():
         shown = " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
@@ -181,9 +189,9 @@ def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:
 
 
 def _expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Expand a xacro document to plain URDF, and return it with xacro's messages.
+    """Expand a xacro document, and return the plain URDF and xacro's messages.
 
-    `first` is the first element that uses xacro, for error messages.
+    `first` is the first element that uses xacro, or None. It appears in error messages.
     """
     import json
     import subprocess

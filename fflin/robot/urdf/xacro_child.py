@@ -1,14 +1,14 @@
 """Program that expands one xacro document in an isolated process that does not import fflin.
 
-Its arguments are the path of the document, the time limit [s], and the folders from which to
-import. Until it has set these folders, it imports only built-in modules.
+The program's arguments are the path of the document, the time limit [s], and the entries of
+`sys.path`. Until the program has set `sys.path`, it imports only built-in modules.
 """
 
 import sys
 
 
 def main(path: str, limit: float) -> None:
-    """Expand a document from stdin; write a JSON line of included files, then the URDF."""
+    """Expand a document from stdin; write included files as one JSON line, then the URDF."""
     import contextlib
     import faulthandler
     import json
@@ -29,7 +29,7 @@ def main(path: str, limit: float) -> None:
             ).to_urdf_string()
     except Exception as error:  # xacro evaluates Python expressions, which may raise anything
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
-    # The list contains included documents and YAML files, each once.
+    # The list contains all included documents and YAML files, without repetition.
     files = json.dumps(sorted(set(xacro.all_includes)))
     sys.stdout.buffer.write(f"{files}\n{urdf}".encode())
 

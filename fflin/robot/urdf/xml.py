@@ -22,8 +22,8 @@ _TAG_LIMIT = 2**20  # bytes
 # No physical value is larger than this, and the product of two such numbers does not overflow.
 _LARGEST = 1e30
 
-# Least similarity at which an unknown name counts as misspelt. For example, "xzy" is similar to
-# "xyz", and "quat" to "quat_xyzw", but "unit" is not similar to "value".
+# Least similarity (0 to 1) at which an unknown name counts as misspelt. For example, "xzy" is
+# similar to "xyz", and "quat" to "quat_xyzw", but "unit" is not similar to "value".
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
@@ -34,7 +34,7 @@ _DECIMAL = re.compile(
 
 @lru_cache(128)  # a file repeats a few names many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
-    """Return the known name most similar to a name, or None if no name is similar enough."""
+    """Return the known name most similar to `name`; None if its similarity is below `cutoff`."""
     import difflib
 
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
@@ -42,7 +42,7 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
 
 @dataclass(eq=False, repr=False, slots=True)
 class Element:
-    """XML element; text between elements is ignored, because URDF has no such text."""
+    """XML element; its text content is not stored, because URDF uses only attributes."""
 
     tag: str  # includes a prefix, which need not be bound to a namespace
     attributes: dict[str, str]
@@ -50,7 +50,7 @@ class Element:
     origin: str  # name of the document in errors: the path of the file
     owner: str = ""  # innermost link or joint that this element is or belongs to, as "joint 'a'"
     children: list[Element] = field(default_factory=list)
-    # {warning: lines}, shared by all elements of the document.
+    # {warning: line numbers}; all elements of a document share this dictionary.
     notes: dict[str, list[int]] = field(default_factory=dict)
 
     @property
@@ -75,8 +75,8 @@ class Element:
     def find(self, tag: str, *attributes: str) -> Element | None:
         """Return the only child with a tag, or None; raise `UrdfError` for a second child.
 
-        If `attributes` are given, they are the known attributes of the child. A misspelt attribute
-        raises `UrdfError`, and any other unknown attribute causes a note.
+        If `attributes` are given, they are the known attributes of the child. An unknown attribute
+        of the child raises `UrdfError` if it is similar to a known one; otherwise it causes a note.
         """
         found = self.find_all(tag)
         if len(found) > 1:
@@ -104,7 +104,10 @@ class Element:
         return found
 
     def refuse_near_miss(self, *known: str) -> None:
-        """Raise `UrdfError` if a child's tag is a misspelt known tag; ignore other unknown tags."""
+        """Raise `UrdfError` if the tag of a child is a misspelt known tag.
+
+        Other unknown tags are ignored.
+        """
         for child in self.children:
             near = child.tag not in known and ":" not in child.tag
             if near and (meant := nearest(child.tag.lower(), known, 0.85)):
@@ -113,7 +116,10 @@ class Element:
                 )
 
     def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
-        """Yield all elements below this element in document order, except the subtrees `skip`."""
+        """Yield all elements below this element in document order.
+
+        Elements whose tags are in `skip` are omitted, with all elements below them.
+        """
         for child in self.children:
             if child.tag not in skip:
                 yield child
@@ -151,7 +157,7 @@ class Element:
 
 
 def decimal(text: str) -> float:
-    """Return a decimal number, which may be infinite; NaN for any other text."""
+    """Return the decimal number in a text, which may be infinite, or NaN for any other text."""
     return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
@@ -171,8 +177,9 @@ def named(kind: str, names: Sequence[str]) -> str:
 
 
 def notes_of(root: Element) -> list[str]:
-    """Return the notes about a document, one line each."""
-    # Notes are saved with the robot, so they contain the file's name without its folder.
+    """Return the notes about a document, with one line for each note."""
+    # Notes are saved with the robot. Therefore they contain the name of the file, but not its
+    # folder, which may differ on another computer.
     origin = root.origin.rpartition(os.sep)[2]
     return [
         f"{origin}:{lines[0]}: {message}"
