@@ -22,6 +22,10 @@ class Times:
     def least(self) -> float:
         return min(self.samples)
 
+    def per(self, count: int) -> "Times":
+        """Return the times of one of `count` equal parts of the function's work."""
+        return Times(tuple(sample / count for sample in self.samples))
+
     def ratio(self, other: "Times") -> float:
         return self.least / other.least
 

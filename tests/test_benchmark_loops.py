@@ -15,6 +15,7 @@ from benchmarks.closed_loop import driven, error, true_end, welded, with_wheels
 from benchmarks.contender import Contender
 from benchmarks.dispersed import SPREADS, draws, fflin_campaign, started
 from benchmarks.peers import WrongResultError
+from fflin.simulation import lanes
 
 pytestmark = pytest.mark.compiled
 
@@ -92,9 +93,9 @@ def test_contender_with_another_end_is_not_timed(wrong):
 
 
 def test_held_and_at_all_times_are_not_the_same_loop():
-    first, held, in_python = loops.fflin_contenders(made("servicer_7dof"))
-    assert [each.name for each in (first, held, in_python)] == [
-        *("fflin", "fflin, held", "fflin, in Python")
+    first, many, held, in_python = loops.fflin_contenders(made("servicer_7dof"))
+    assert [each.name for each in (first, many, held, in_python)] == [
+        *("fflin", "fflin, 25,000 steps", "fflin, held", "fflin, in Python")
     ]
     for each in (first, held, in_python):
         each.run()
@@ -110,6 +111,14 @@ def test_rows_have_the_floor_and_every_contender():
     for row in rows:
         least, median, most = (float(cell.replace(",", "")) for cell in row[3:6])
         assert 0.0 < least <= median <= most and float(row[6]) < loops.WORST
+
+
+def test_the_long_run_is_one_that_is_compiled_by_default_and_is_timed_by_its_own_steps():
+    first, many, *_ = loops.fflin_contenders(made("cubesat"))
+    assert many.loop.steps == loops.MANY > lanes.LONG > first.loop.steps
+    assert many.loop.duration == first.loop.duration
+    times = timing.Times((2.0, 3.0)).per(many.loop.steps)
+    assert times.samples == (2.0 / loops.MANY, 3.0 / loops.MANY)
 
 
 def without_peers(monkeypatch):
@@ -129,7 +138,7 @@ def without_peers(monkeypatch):
 def test_peers_that_are_not_there_are_named(find, monkeypatch):
     without_peers(monkeypatch)
     found, notes = find(made("cubesat"))
-    assert len(found) == (3 if find is loops.contenders else 0)
+    assert len(found) == (4 if find is loops.contenders else 0)
     assert [note.partition(":")[0] for note in notes] == ["MuJoCo", "Drake", "Basilisk"]
     assert all("not installed" in note for note in notes)
 

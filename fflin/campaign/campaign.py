@@ -395,9 +395,9 @@ class Campaign(FrozenArrays):
     ) -> Campaign:
         """Return a campaign from its header and arrays; rows of missing runs are left out."""
         run = np.asarray(arrays["stop"]) != NOT_RUN
-        values: dict[str, Any] = {
-            key: arrays[key] if run.all() else arrays[key][run] for key in ARRAYS
-        }
+        values = dict[str, Any]()
+        for key in ARRAYS:
+            values[key] = arrays[key] if run.all() else arrays[key][run]
         for key in _HEADER:
             value = header[key]
             values[key] = tuple(value) if isinstance(value, list) else value

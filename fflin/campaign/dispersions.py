@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, repeat
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ class Dispersions:
             sensors = reads.lin.output_names
         elif isinstance(reads, TrajectoryOutputFeedback):
             sensors = reads.filter.output_names
-        modes = tuple(each.name for each in robot.modes)
+        modes = tuple(map(attrgetter("name"), robot.modes))
         # {kind of dispersion: names of the quantities that can be dispersed}.
         self._known: dict[str, tuple[str, ...]] = {
             **dict.fromkeys(_OF_SENSORS, sensors),
@@ -81,7 +82,7 @@ class Dispersions:
         kinds = [*self._known]
         self._known |= {"state": plant.state.names, "delay": ("delay",), "seed": (SEED,)}
         # Joint index of each mode, in the order of `modes`.
-        self._modes = [robot.joint_names.index(name) for name in modes]
+        self._modes = [*map(robot.joint_names.index, modes)]
         by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
@@ -107,7 +108,7 @@ class Dispersions:
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, " | ".join(kinds))
         # Names of the dispersed values.
-        self.names = tuple(column.name for column in self.columns)
+        self.names = tuple(map(attrgetter("name"), self.columns))
         # Cached values of slow distributions: {(name, block of runs): values}.
         self._kept: dict[tuple[str, int], Array] = {}
         # A mass must not be dispersed twice, such as for a link and for the whole body of the link.
@@ -181,7 +182,7 @@ class Dispersions:
         a key overrides patterns that match the same link or body.
         """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
-        alone = {*robot.pieces, *robot.link_of}
+        alone, whole = {*robot.pieces, *robot.link_of}, set[int]()
         for key in sorted(spreads, key=alone.__contains__):  # names override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
@@ -191,7 +192,8 @@ class Dispersions:
                 found[name] = spreads[key]
                 if key in alone:
                     named[name] = key
-        whole = {robot.pieces[name].joint for name in named if robot.pieces[name].whole}
+                    if robot.pieces[name].whole:
+                        whole.add(robot.pieces[name].joint)
         for name in found.keys() - named:
             if robot.pieces[name].joint in whole:
                 del found[name]
@@ -282,16 +284,19 @@ class Dispersions:
         Only dispersed bodies are included. The inertias are about the centres of mass.
         """
         robot, model = self._plant.robot, self._model
-        pieces, changed = [*robot.pieces.values()], dict[int, list[Array]]()
-        mass, com, inertia, density = (self._of(kind, drawn) for kind in _OF_BODIES)
-        dispersed = {at for each in self.columns if each.kind in _OF_BODIES for at in each.at}
+        pieces, dispersed = [*robot.pieces.values()], set[int]()
+        mass, com, inertia, density = map(self._of, _OF_BODIES, repeat(drawn))
+        for column in self.columns:
+            if column.kind in _OF_BODIES:
+                dispersed.update(column.at)
+        changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4)
         for at in sorted(dispersed):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            changed.setdefault(own, []).append(varied(pieces[at], *changes))
-        before = {joint: model.inertias[joint].toPseudoInertia().toMatrix() for joint in changed}
-        return {joint: properties(before[joint] + sum(x)) for joint, x in changed.items()}
+            before = changed.get(own, model.inertias[own].toPseudoInertia().toMatrix())
+            changed[own] = before + varied(pieces[at], *changes)
+        return dict(zip(changed, map(properties, changed.values()), strict=True))
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
         """Return {"stiffness" or "damping": values (N, n) of all joints}.
@@ -368,12 +373,10 @@ class Dispersions:
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
         if bodies:
-            robot = robot.with_bodies(
-                {
-                    joint: pin.Inertia(float(mass[0]), com[0], inertia[0])
-                    for joint, (mass, com, inertia) in bodies.items()
-                }
-            )
+            drawn_bodies = dict[int, pin.Inertia]()
+            for joint, (mass, com, inertia) in bodies.items():
+                drawn_bodies[joint] = pin.Inertia(float(mass[0]), com[0], inertia[0])
+            robot = robot.with_bodies(drawn_bodies)
         springs = {"stiffness": robot.stiffness, "damping": robot.damping}
         for kind, values in self._springs(rows).items():
             springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))

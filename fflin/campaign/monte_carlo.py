@@ -209,7 +209,7 @@ def monte_carlo(
     if how.executor:
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
-    none = {key: np.zeros((0, *shape)) for key, shape in shapes.items()}
+    none = files.MemoryStore(0, size, shapes).arrays
     header["goals"] = wanted = _goals(goals, until, Campaign.of(none, {**header, "goals": ()}))
     with placed(dispersions):
         job.dispersions.require_possible(runs)
@@ -300,11 +300,13 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 def _header(job: CampaignJob) -> dict[str, object]:
     """Return the fields of a campaign that are not arrays and follow from its job."""
-    plan, plant, robot = job.plan, job.plant, job.plant.robot
-    others = {f"q_m.{name}" for name in (*robot.wheels, *(mode.name for mode in robot.modes))}
-    steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - others}
-    steered -= set() if pushed(plant.actuation) else {"r_b"}
-    groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
+    plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
+    fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
+    for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
+        if fed_back[part][job.kinds[part] == number].any():
+            judged.append(kind)
+    if "position" in judged and not pushed(plant.actuation):
+        judged.remove("position")
     return {
         "kind": "Campaign",
         "names": job.dispersions.names,
@@ -312,7 +314,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "state_units": plant.state.units,
         "input_names": plant.actuation.names,
         "input_units": plant.actuation.units,
-        "judged": [kind for kind, group in groups if group in steered],
+        "judged": judged,
         "robot": robot.name,
         "urdf_sha256": robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,

@@ -79,7 +79,9 @@ Judge: TypeAlias = Callable[[Mapping[str, Array]], dict[str, Array]]
 
 def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
     """Return the arrays of `outcomes` that a `Campaign` contains: all except `state_errors`."""
-    return {key: values for key, values in outcomes.items() if key != "state_errors"}
+    found = dict(outcomes)
+    del found["state_errors"]
+    return found
 
 
 def kinds_of(state: StateMap) -> Indices:
@@ -89,13 +91,13 @@ def kinds_of(state: StateMap) -> Indices:
     attitude and for all states without a kind: modes and wheel speeds.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
-    groups, wheels = state.groups, state.robot.wheels
+    groups, wheels, modes = state.groups, state.robot.wheels, state.robot.modes
     for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
         kind[group] = number
     kind[groups.qdot_m] = len(KINDS) - 1
     for index, joint in enumerate(state.robot.joints):
-        if joint.mode or joint.name in wheels:
-            kind[groups.q_m.start + index] = 0 if joint.mode else -1
+        if joint in modes or joint.name in wheels:
+            kind[groups.q_m.start + index] = 0 if joint in modes else -1
             kind[groups.qdot_m.start + index] = 0
     return kind
 
@@ -131,6 +133,7 @@ class CampaignJob:
             self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.judge, self.over = judge, over
         self.plant, times = self.plan.plant, self.plan.times
+        self.kinds = kinds_of(self.plant.state)
         self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
@@ -196,7 +199,7 @@ class CampaignJob:
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
         drawn = rows["drawn"]
-        found = {key: np.empty((len(drawn), *x)) for key, x in self.outcome_shapes.items()}
+        found = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
             eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
@@ -232,12 +235,13 @@ class CampaignJob:
         NaN after the run was stopped.
         """
         count, steps, dt = len(run.q), self.steps, self.plan.times.dt
-        kind, target = kinds_of(self.plant.state), self.target
-        target = target[:count] if target.ndim == 2 else target
+        target = self.target[:count] if self.target.ndim == 2 else self.target
         x, signed = self.errors(run.q, run.v)
-        e, u = np.where(kind < 0, 0.0, np.abs(signed)), np.abs(run.u)
-        others = [e[:, kind == of].max(axis=1, initial=0.0) for of in range(1, len(KINDS))]
-        sizes = np.column_stack([attitude_errors(x, target), *others])
+        e, u = np.where(self.kinds < 0, 0.0, np.abs(signed)), np.abs(run.u)
+        sizes = np.empty((count, len(KINDS)))
+        sizes[:, 0] = attitude_errors(x, target)
+        for kind in range(1, len(KINDS)):
+            sizes[:, kind] = e[:, self.kinds == kind].max(axis=1, initial=0.0)
         settled, stop = settled_at(sizes), stop_of(run.stopped)
         late, kept = is_late(settled, count) | (stop > 0), steps[steps < count]
 
@@ -331,7 +335,7 @@ class RunStatistics(lanes.Statistics):
             x_ref=first,
             q_ref=q_ref,
             nu_ref=nu_ref,
-            kind=kinds_of(state),
+            kind=job.kinds,
             settled=SETTLED,
             tolerance=np.full(kinds, THERE),
             steps=job.steps,

@@ -39,16 +39,18 @@ class Report:
     robot : str or None
         Name of the robot.
     result : object
-        Result of the library, or a mapping; --json prints its fields.
+        Result of the library, or a mapping. --json prints the fields of the result, or the entries
+        of the mapping.
     text : str
-        Report without --json. Its first paragraph is the entry "result" of --json.
+        Text that is printed without --json. The first paragraph is the entry "result" of --json.
     files : mapping
         {path: function that writes the file, or None if the file is already written}. An entry with
         the path None is ignored.
     code : int
         Exit code.
     interrupted : str
-        Reason of an interruption, or "". Existing files are not replaced after an interruption.
+        Reason why the computation was interrupted, or "". After an interruption, existing files are
+        not replaced.
     """
 
     robot: str | None
@@ -66,7 +68,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    # Give these settings to `load`, because its warnings depend on them.
+    # `load` gets these two settings, because its warnings depend on them. All other settings are
+    # applied after loading.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
@@ -97,19 +100,19 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 def limits_of_options(
     arguments: Namespace,
 ) -> list[str | dict[str, float]] | dict[str, float] | None:
-    """Return the limits that the options --limits and --limit define."""
+    """Return the limits of the inputs that the options --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 
 
 def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
-    """Raise an error if any option in `names` is given; `why` explains why it has no effect."""
+    """Raise an error with the reason `why` if any option in `names` is given."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
 def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
-    """Return the values of a repeatable option by name; raise an error if a name is given twice."""
+    """Return {name: value} of a repeatable option; raise an error if a name is given twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
@@ -121,12 +124,11 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
 def state_of(
     robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None]:
-    """Combine states of a robot and the options of a command; return q (nq,) and v (nv,).
+    """Combine `states` with the options of a command; return q (nq,) and v (nv,) or None.
 
-    Later states override earlier states, and options override all states.
-
-    The options are --joint, --rpy, --position and --velocity. Their names may have a prefix, such
-    as ``target_``. A joint outside its limits causes a warning.
+    Later states override earlier states, and options override all states. The options are --joint,
+    --rpy, --position and --velocity. Their names can have a prefix, such as ``target_``. A joint
+    outside its limits causes a warning.
     """
     from fflin.dynamics.points import base_of, combined
     from fflin.robot.fields import travel_of
@@ -158,8 +160,8 @@ def point_of(
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
     """Return q (nq,), v (nv,) and the reference of the operating point.
 
-    With the prefix ``target_``, return those of the target. With --relative-equilibrium, the base
-    pose is the pose of that equilibrium, which is also the reference.
+    With the prefix ``target_``, return the q, v and reference of the target. With
+    --relative-equilibrium, the pose of this equilibrium is both the base pose and the reference.
     """
     number = getattr(arguments, "relative_equilibrium", None)
     if number:
@@ -174,14 +176,14 @@ def point_of(
 
 
 def reference_of(arguments: Namespace) -> pin.SE3 | None:
-    """Return the reference from --reference; None is the base pose at the operating point."""
+    """Return the reference of --reference; None means the base pose at the operating point."""
     import pinocchio as pin
 
     return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
 
 
 def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
-    """Return the robot and its linear model about the operating point of the arguments."""
+    """Return the robot, and its linear model about the operating point in the arguments."""
     robot = load_robot(arguments)
     return robot, model_about(robot, arguments, *point_of(robot, arguments))
 
@@ -191,7 +193,7 @@ def model_about(
 ) -> fflin.LinearModel:
     """Linearise about q (nq,) and v (nv,), with inputs from --effort or --equilibrium.
 
-    With --reduce, the model is reduced by its conserved momentum.
+    With --reduce, the conserved momenta are removed from the model.
     """
     axes = {"frame": arguments.frame, "reference": reference}
     given = once("--effort", arguments.effort)
@@ -216,7 +218,7 @@ def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[A
 
 
 def models_along(arguments: Namespace, robot: fflin.Robot | None = None) -> fflin.LinearTrajectory:
-    """Return the linear models along the trajectory in the arguments."""
+    """Return the linear models along the trajectory of --trajectory."""
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
     refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
     robot = robot or load_robot(arguments)
@@ -232,8 +234,8 @@ def robot_of_design(
 ) -> fflin.Robot:
     """Return the robot of a design; for allocation, a base torque and force replace thrusters.
 
-    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base. A
-    given `law` must also command a base torque.
+    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base, and
+    if `law`, when it is given, commands a base torque.
     """
     if allocate is None:
         from fflin.control.authority import thrusters_give_every_wrench
@@ -256,7 +258,7 @@ def robot_of_design(
 def designed(
     arguments: Namespace,
 ) -> tuple[fflin.Robot, fflin.Robot, fflin.LinearModel, fflin.Gain]:
-    """Return the robot, the robot of the design, the regulated linear model, and its regulator."""
+    """Return the robot, the robot of the design, its linear model, and the model's regulator."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
     lin = model_about(design, arguments, *point_of(design, arguments))
@@ -264,7 +266,7 @@ def designed(
 
 
 def weights_of(arguments: Namespace) -> dict[str, object]:
-    """Return the rule of --weights, and the weights of --q, --r and --bryson."""
+    """Return a mapping with the rule of --weights, and the weights of --q, --r and --bryson."""
     names = ("q", "r", "bryson")
     given = {name: once(f"--{name}", getattr(arguments, name)) for name in names}
     return {"rule": arguments.weights, **given}
@@ -341,10 +343,10 @@ def start_of(
 def about_point(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
-    """Return the policy about a point, its linear feedback, and the model for the prediction.
+    """Return the policy about a point, its linear feedback, and the model that predicts the motion.
 
-    The model is None for MPC, a reduced model, a controller from a file, or allocated thrusters.
-    `simulate` then predicts with the policy's own model, or not at all.
+    The model is None for MPC, for a reduced model, for a controller from a file, and for allocated
+    thrusters. `simulate` then predicts with the policy's own model, or does not predict.
     """
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
@@ -387,7 +389,8 @@ def about_point(
 def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
     """Return the linear model about the point for which a gain was designed.
 
-    If the base is at the reference of the gain, the target pose of the base is the new reference.
+    If the gain was designed with the base at its reference, the target pose of the base is the new
+    reference. Otherwise, the reference of the gain is used.
     """
     import pinocchio as pin
 
@@ -438,7 +441,7 @@ def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
 def pictures(
     robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
 ) -> dict[Path | None, Callable[[Path], object]]:
-    """Return {path: function that writes it} for the requested page and pictures of a motion."""
+    """Return {path: function that writes the file} for a web page and pictures of a motion."""
     how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *SHOWN)}
 
     def show(path: Path) -> None:

@@ -167,8 +167,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             }
             result = plain(report.result)
             assert isinstance(result, dict)
-            # The common entries come first. An entry of the result with the same name does not
-            # replace them.
+            # The entries of `head` come first, and an entry of the result with the same name does
+            # not replace them.
             print(json.dumps(head | result | head, allow_nan=False))
         else:
             lines = [headed(command, report.text)]
@@ -184,7 +184,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
 def plain(value: object) -> object:
     """Convert a value for JSON: arrays to lists, results to objects, and inf or NaN to null.
 
-    A result that can be saved is converted to the entries of its file, other results to their
+    A model or design is converted to the entries of its file. Any other result is converted to its
     fields.
     """
     import numpy as np
@@ -202,7 +202,7 @@ def plain(value: object) -> object:
         value = record_of(value)
     elif is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
-        # Omit linear models, because they are results of their own.
+        # Omit the linear models in a result, because each is a result of its own.
         value = {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
     elif hasattr(value, "_asdict"):
         value = value._asdict()
@@ -214,7 +214,7 @@ def plain(value: object) -> object:
 
 
 def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
-    """Raise `FileError` if -o would replace a file of another kind."""
+    """Raise `FileError` if -o would replace a file without a result of one of these kinds."""
     if path.suffix == ".csv" and "LinearModel" in kinds:
         from fflin.linear.files import foreign_table
 

@@ -1,4 +1,4 @@
-"""Commands for controllers, C code and simulations, for campaigns, and for sweeps of models."""
+"""Commands that design controllers, write C code, and compute simulations, campaigns and sweeps."""
 
 from __future__ import annotations
 
@@ -295,7 +295,7 @@ def sweep(arguments: Namespace) -> Report:
 def _points(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[Configurations, Array | None, Array | None]:
-    """Return the configurations q of a sweep, and the v and u that all its points share."""
+    """Return the configurations q of a sweep, and v and u, which are the same at all points."""
     import numpy as np
     import pinocchio as pin
 
@@ -323,7 +323,7 @@ def _points(
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Show a progress bar; after Ctrl-C, report the progress and how to resume."""
+    """Return a context with a progress bar; after Ctrl-C, it reports how to resume the command."""
     from fflin.batch.files import part_of
 
     bar = Progress()

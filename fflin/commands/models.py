@@ -28,7 +28,7 @@ from fflin.commands.builders import (
     state_of,
 )
 
-# Entries of f0 [SI] below this value count as zero.
+# Entries of f0 [SI] up to this magnitude count as zero.
 _MOVES = 1e-9
 
 _SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
@@ -46,7 +46,7 @@ def robots(_: Namespace) -> Report:
         found = find_robot(name)
         try:
             with warnings.catch_warnings():
-                # Do not show these warnings here; `fflin info` shows them.
+                # Ignore the warnings of `load` here, because `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 robot = fflin.load(name)
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", found.origin])
@@ -206,8 +206,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [folded([head, *_units(lin)])]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Report poles only at an equilibrium: along a motion, they do not determine stability. If A A =
-    # 0, all poles are zero and none is reported.
+    # Report unstable poles only at an equilibrium, because poles do not determine the stability of
+    # a motion. If A^2 = 0, all poles are zero, so none is unstable.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
@@ -239,7 +239,11 @@ def model_report(lin: fflin.LinearModel) -> str:
 
 
 def _units(lin: fflin.LinearModel) -> list[str]:
-    """Return a line with the units of the states, inputs or outputs, one per group of names."""
+    """Return one line each with the units of the states, inputs and outputs.
+
+    For example, the line of the inputs is "u: tau_b [N m], F_b [N], tau_m [N m]". The outputs are
+    omitted if they are the states.
+    """
     signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units

@@ -136,7 +136,7 @@ _SATURATION = (
     "saturate them (none, default)"
 )
 
-# {option or ARGUMENT: help}. A key "COMMAND OPTION" is for a single command.
+# {option or ARGUMENT: help}. A key "COMMAND OPTION" applies to this command only.
 ABOUT: dict[str, str] = {
     "ROBOT": "robot name listed by `fflin robots`, or path of a URDF or robot.toml",
     "joint": "position of a joint [rad|m]. The default is the position in robot.toml or, if there "

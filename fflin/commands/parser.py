@@ -1,4 +1,4 @@
-"""Parser of a command, forms of its options, and functions that read their values."""
+"""Parser of a command, the forms of its options, and functions that read option values."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def input_name(text: str) -> str:
 class OutputFile:
     """Reader for the path of an output file, which must have one of the `endings`.
 
-    If `kinds` is not empty, an existing file is replaced only if it contains one of these kinds of
-    results.
+    If `kinds` is not empty, -o without --force replaces an existing file only if the file contains
+    a result of one of these kinds.
     """
 
     endings: tuple[str, ...]
@@ -83,9 +83,9 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def joint_or_all(text: str) -> tuple[str | None, float | str]:
-    """Read NAME=VALUE for one joint; for all joints, read VALUE or the word `urdf`.
+    """Read NAME=VALUE for one joint, or VALUE or the word `urdf` for all joints.
 
-    For all joints, the returned name is None.
+    Return (name, value); the name is None for all joints.
     """
     if "=" in text:
         return assignment(text)
@@ -93,7 +93,7 @@ def joint_or_all(text: str) -> tuple[str | None, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE, or NAME alone; the value None then stands for the neutral position."""
+    """Read NAME=VALUE or NAME; without a value, return None, which means the neutral position."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -104,7 +104,7 @@ def orbit(text: str) -> dict[str, float | str]:
 
 
 def parameter_range(text: str) -> tuple[str, object]:
-    """Read NAME=FRACTION or NAME=LEAST:LARGEST, either of which may end with ",tied"."""
+    """Read NAME=FRACTION or NAME=LEAST:LARGEST; both forms can end with ",tied"."""
     name, ends = _parts(text, "NAME=FRACTION or NAME=LEAST:LARGEST", 1, 2)
     tied = ends[-1].endswith(",tied")
     ends[-1] = ends[-1].removesuffix(",tied")
@@ -128,7 +128,7 @@ def joint_range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _parts(text: str, form: str, *counts: int) -> tuple[str, list[str]]:
-    """Split NAME=A:B:... into the name and its values; their number must be one of `counts`."""
+    """Split NAME=A:B:... into NAME and [A, B, ...]; `counts` are the valid numbers of values."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
     if not name or len(parts) not in counts:
@@ -145,7 +145,7 @@ def one(
     default: float | str | None = None,
     **more: object,
 ) -> Form:
-    """Return the form of an option that is given once."""
+    """Return the form of an option that may be given only once."""
     return {"type": reader, "metavar": metavar, "default": default, **more}
 
 
@@ -155,7 +155,7 @@ def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
 
 
 def _saved(*kinds: str, endings: tuple[str, ...] = (".npz", ".mat", ".json")) -> Form:
-    """Return the form of -o for results of some kinds."""
+    """Return the form of -o for a command whose results are of these kinds."""
     return one(OutputFile(endings, kinds), "FILE")
 
 
@@ -170,8 +170,8 @@ _FORMER: Form = {**_TIME, "dest": "former_dt"}
 _UNSATURATED: Form = {"choices": ("urdf", "none"), "default": "none"}
 _TABLE = (".npz", ".mat", ".json", ".csv")
 
-# {option or ARGUMENT: form of its value}. A key "COMMAND OPTION" is for a single command. Options
-# that are not listed are switches.
+# {option or ARGUMENT: form of its value}. A key "COMMAND OPTION" applies to this command only.
+# Options without an entry are switches.
 FORMS: dict[str, Form] = {
     "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
     "URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"},
@@ -272,7 +272,7 @@ class Command(argparse.ArgumentParser):
     """Parser of a command that reports errors in one line."""
 
     def _print_message(self, message: str, file: object = None) -> None:
-        # Print the text here, because argparse would ignore an error in writing it.
+        # Print the text here, because argparse would ignore an error while it writes the text.
         print(message, end="", flush=True)
 
     def error(self, message: str) -> NoReturn:
@@ -374,7 +374,7 @@ def short_help(command: argparse.ArgumentParser) -> str:
 
 
 def settle_former_names(arguments: argparse.Namespace) -> None:
-    """Accept former names with a warning: --step is now --dt, and the former --dt is --sample."""
+    """Accept former option names with a warning: --step (now --dt) and --dt (now --sample)."""
     if (step := getattr(arguments, "step", None)) is not None:
         said = "the integration step --step has the new name --dt"
         if arguments.dt is not None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
+from operator import attrgetter
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
@@ -238,15 +239,16 @@ def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
 
 def readout(
     state: StateMap, K: Array, offset: Array, near: Array
-) -> Callable[[Array, Array], Array]:
-    """Return the function f(q, v) = offset - K x(q, v), which a policy evaluates at each sample.
+) -> Callable[[float, Array, Array], Array]:
+    """Return the law u(t, q, v) = offset - K x(q, v), which a policy evaluates at each sample.
 
     In the state x, the angles of continuous joints are within half a turn of `near` (nx,).
     """
-    # The state x is linear in the vector z below. So f is one matrix-vector product, which takes a
+    # The state x is linear in the vector z below. So u is one matrix-vector product, which takes a
     # fifth of the time of computing x.
     robot, g = state.robot, state.groups
-    idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
+    idx_q = np.array([*map(attrgetter("idx_q"), robot.joints)], dtype=np.intp)
+    scales = np.array([*map(attrgetter("scale"), robot.joints)])
     circling, cos = state.unbounded, idx_q[state.unbounded]
     middle = near[g.q_m][circling]
     # x = S z, where z stacks q, v, the angles of continuous joints, omega_b and v_b in world axes,
@@ -256,7 +258,7 @@ def readout(
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(S, ends, axis=1)
     at, turn = state.origin, turning.product_matrix(state.origin_quaternion)
     of_q[g.q_b, 3:7], of_q[g.r_b, :3], constant[g.r_b, 0] = turn[:3], at.rotation, at.translation
-    of_q[g.q_m][np.arange(robot.n), idx_q] = [1.0 / joint.scale for joint in robot.joints]
+    of_q[g.q_m][np.arange(robot.n), idx_q] = 1.0 / scales
     of_q[:, cos] = 0.0
     of_angles[6 + circling] = np.eye(len(circling))
     of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
@@ -271,7 +273,7 @@ def readout(
     z_turn, scalar = z_q[3:7], turn[3]
     turned_angular, turned_linear = state.axes
 
-    def f(q: Array, v: Array) -> Array:
+    def law(_: float, q: Array, v: Array) -> Array:
         z_q[:], z_v[:] = q, v
         if scalar.dot(z_turn) < 0.0:
             z_turn[:] = -z_turn
@@ -285,7 +287,7 @@ def readout(
                 z_angular[:] = R.dot(v[3:6])
         return gains.dot(z)
 
-    return f
+    return law
 
 
 def state_history(

@@ -55,9 +55,10 @@ def configuration(
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    values = numbers("joints", {} if joints is None else joints, "joint", "joint")
-    for name, value in by_joint(values, robot.joint_names, robot.joint).items():
-        robot.joint(name).place(q, value)
+    if joints is not None:
+        values = numbers("joints", joints, "joint", "joint")
+        for name, value in by_joint(values, robot.joint_names, robot.joint).items():
+            robot.joint(name).place(q, value)
     robot.follow(q)
     return robot.checked_configuration(q)
 
@@ -99,7 +100,8 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
     """
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
-    return q, velocity(robot, start.get("velocity", {}))
+    rates = start.get("velocity")
+    return q, velocity(robot, rates) if rates else np.zeros(robot.nv)
 
 
 def point_of(

@@ -245,7 +245,7 @@ class StateMap:
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
-        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        in_frame = chart.to_reference(self.in_reference, nu[..., None])[..., 0]
         return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: ArrayLike) -> tuple[Array, Array]:
@@ -294,7 +294,8 @@ class StateMap:
         q[:, self._sin] = np.sin(angles[:, self.unbounded])
         for row in q if self.robot.followers else ():
             self.robot.follow(row)
-        return chart, q, self.spread(self.to_base(chart, x[:, 6 + self.robot.n :, None])[..., 0])
+        nu = chart.to_base(self.in_reference, x[:, 6 + self.robot.n :, None])[..., 0]
+        return chart, q, self.spread(nu)
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes from Pinocchio's v (.., nv)."""

@@ -105,7 +105,7 @@ def law_of(given: object, robot: object, limits: object) -> Law:
                 "limits need the robot with the inputs of the law; give the robot of the design "
                 "with robot= (--robot)"
             )
-        low, high = input_limits(robot, chosen_limits(robot, limits)[0])
+        low, high = input_limits(robot, chosen_limits(robot, limits))
     law.tables.update(low=low, high=high)
     return law
 

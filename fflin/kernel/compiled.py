@@ -61,7 +61,7 @@ def available_cores() -> int:
     cores = len(os.sched_getaffinity(0))
     for names in _QUOTAS:
         try:
-            quota, period = " ".join(Path(name).read_text() for name in names).split()
+            quota, period = " ".join(map(Path.read_text, map(Path, names))).split()
         except (OSError, ValueError):
             continue
         if quota not in ("max", "-1"):

@@ -23,11 +23,11 @@ class Wheels(
 ):
     r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
 
-    A torque u changes the speed w by u dt / J in a step of dt [s]. J is the inertia that the
-    motor accelerates if the rest of the robot is free to react: 1 / (M^-1)_ii of the wheel's joint.
+    A torque u changes the speed w by u dt / J in a step of dt [s]. J = 1 / (M^-1)_ii is the
+    effective inertia of the wheel's joint i in the free-floating robot.
 
     - `at`: index of the wheel's input. `row`: index of its speed in nu.
-    - `least_torque`, `most_torque` [N m]: torque limits, which also apply.
+    - `least_torque`, `most_torque` [N m]: torque limits of the motor.
     - `least_speed`, `most_speed` [rad/s]: speed limits.
     - `stiffness`: J / dt.
     """
@@ -51,11 +51,11 @@ class Channel(
     """Channel from commands (nu,) to inputs: limits, sample and hold, delay, wheels and pulses.
 
     - `low`, `high` (nu,): limits of the commands.
-    - `held` (nu,): the command that acts. `pending` (slots, nu): the commands of the latest
+    - `held` (nu,): the command that acts now. `pending` (slots, nu): the commands of the latest
       samples. Some of them have not arrived yet.
     - `sample`: number of steps per sample, 0 for continuous commands. `delay` (1,): delay in steps.
     - `fresh` (1,): 1 in a step in which a command arrives, else 0. It is also 1 at each sample
-      before the first arrival, so that the initial inputs are pulsed too.
+      before the first arrival, so that the initial inputs are also pulsed.
     """
 
 
@@ -146,7 +146,8 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # The tolerance fires an impulse that is below the least impulse only by rounding errors.
+        # Due to the tolerance 1e-9, an impulse fires even if rounding errors make it smaller than
+        # the least impulse.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -191,8 +192,8 @@ class Arguments(
     """Arguments of `advance`.
 
     If `project` is true, each step ends with a correction of the base, which restores momentum and
-    centre of mass (`forward.impose`). If `pushed` is true, external wrenches are integrated
-    (`forward.add_wrench`).
+    centre of mass (`forward.impose`). If `pushed` is true, external wrenches are integrated for
+    the momentum reference (`forward.add_wrench`).
     """
 
 
@@ -326,8 +327,9 @@ class RunStatistics(
     - `x_ref` (nx,): the reference state. `path.point.q` contains its attitude as a quaternion.
     - `q_ref`, `nu_ref`: with a moving reference, the rows of q and nu at all steps; else empty.
     - `law`: the law by which `read_state` computes states.
-    - `kind` (nx,): the index of each state's kind, such as joint positions. The index is 0 for the
-      attitude and for states without a kind, and -1 for states that `largest_x` ignores.
+    - `kind` (nx,): the index of the kind to which each state belongs. One kind, for example, is all
+      joint positions. The index is 0 for the attitude and for states without a kind, and -1 for
+      states that `largest_x` ignores.
     - `settled`, `tolerance` (kinds,): the error of a kind has settled when it stays below `settled`
       times its largest value, or below its `tolerance`.
     - `steps` (times,): the steps at which `errors` (of the kinds), `inputs` and `states` (errors of

@@ -51,12 +51,12 @@ _BYTES = 8  # alignment of a double
 # Function that generates the code of an operation on LLVM values, and returns the LLVM value of the
 # operation's result.
 Generator: TypeAlias = Callable[..., ir.Value]
-# Function from the numba types of an operation's arguments to the signature of the operation.
+# Function that maps the numba types of an operation's arguments to the operation's signature.
 Typer: TypeAlias = Callable[..., Signature]
 
 
 class Lanes(Type):
-    """numba type of eight doubles in one vector; numba converts a double to eight equal ones."""
+    """numba type of eight doubles in one vector; numba converts one double to eight equal lanes."""
 
     def can_convert_from(self, _: TypingContext, other: Type) -> Conversion | None:
         """Return numba's kind of conversion if `other` is a double, and None for other types."""
@@ -204,9 +204,10 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
 
 
 class _NoEnvironments:
-    """numba code generator that sets no environment, the run-time data of a numba function.
+    """numba code generator for parts, which sets no environment.
 
-    numba would store the environment's address in the machine code, which a part does not have.
+    An environment is the run-time data of a numba function. numba would store its address in the
+    function's machine code, but a part has no machine code.
     """
 
     def __init__(self, codegen: object) -> None:

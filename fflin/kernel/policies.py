@@ -73,7 +73,7 @@ def error(robot, path, point):
     """Write the error (5.1) of `point` relative to the followed point into `path.e`.
 
     The position error is in the axes of the followed base. The velocity error is the difference of
-    nu, in which each base velocity is in the axes of its own base.
+    the two nu, each of which is in the axes of its own base.
     """
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
@@ -162,7 +162,7 @@ class Law(
     - `near` (rows, n): positions for unwrapping. The unwrapped angle of a continuous joint differs
       from its position in `near` by at most pi.
     - `origin` and `near` have one row per sample. The last row also applies to all later samples.
-    - `u`: the command. If `allocation` has inputs, it distributes the command to them.
+    - `u`: the command. If `allocation` has inputs, the command is distributed to these inputs.
     """
 
 
@@ -194,7 +194,10 @@ LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocatio
 
 @called
 def read_state(robot, law, point, row):
-    """Write the state of a point into `law.x`, with this row of `law.origin` and `law.near`."""
+    """Write the state of a point into `law.x`.
+
+    `row` is the index of the row of `law.origin` and `law.near` that applies.
+    """
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
     position, turn = vec.get3(law.origin, 7 * row), vec.attitude(law.origin, 7 * row)
     vector, scalar = vec.quaternion_times(turn, vec.attitude(q))
@@ -274,8 +277,8 @@ def _feed_back_between(robot, law, point):
 def _corner(grid, corner, lane):
     """Return the weight of a grid corner in the interpolation, and the index of its gain in `K`.
 
-    The corner belongs to the grid cell in which the joints of the lane are. Bit i of `corner` is 1
-    at the upper grid value of joint i, and 0 at the lower one.
+    The corner belongs to the grid cell that contains the joint positions of the lane. Bit i of
+    `corner` is 1 at the upper grid value of joint i, and 0 at the lower grid value.
     """
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):

@@ -27,11 +27,17 @@ from fflin.robot.robot import Robot
 LANES = 8  # number of points that the kernel evaluates with each instruction
 
 
+def address_of(array: NDArray[np.generic]) -> int:
+    """Return the address of the first entry of an array in memory."""
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
 def work_space(size: int) -> Array:
     """Return an uninitialised array (size, LANES)."""
     space = np.empty((size + 1) * LANES)
     # The eight doubles of an entry have 64 bytes. Access is faster if they are aligned to 64 bytes.
-    first = -(space.ctypes.data // 8) % LANES
+    first = -(address_of(space) // 8) % LANES
     return space[first : first + size * LANES].reshape(size, LANES)
 
 
@@ -102,15 +108,19 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
     the addresses of the converted arrays, so the converted tuple must exist as long as the words
     are used.
     """
+    words, fresh = list[int](), list[tuple[Array, Array]]()
+    return _lay_out(value, kind, words, fresh), np.array(words, dtype=np.int64), fresh
+
+
+def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]) -> T:
+    """Return the converted tuple of `laid_out`; append to its lists `words` and `fresh`.
+
+    `words` receives the words of the tuple, `fresh` one pair for each array with lanes.
+    """
     parts: list[object] = []
-    words: list[int] = []
-    fresh: list[tuple[Array, Array]] = []
     for part, of in zip(value, kind.kinds.values(), strict=True):
         if isinstance(of, Struct):
-            inner, of_inner, new = laid_out(part, of)
-            parts.append(inner)
-            words += of_inner.tolist()
-            fresh += new
+            parts.append(_lay_out(part, of, words, fresh))
         elif of.axes:
             array = np.ascontiguousarray(part, of.dtype)
             if of == LANED:
@@ -119,12 +129,12 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
                 fresh.append((array, column))
             assert array.ndim == of.axes
             parts.append(array)
-            words += [array.__array_interface__["data"][0], *array.shape]
+            words += (address_of(array), *array.shape)
         else:
             number = of.dtype(part).item()
             parts.append(number)
             words.append(int(np.float64(number).view(np.int64)) if of == REAL else int(number))
-    return value._make(parts), np.array(words, dtype=np.int64), fresh
+    return value._make(parts)
 
 
 # PLACE is the number of entries of a body's pose: x axis, y axis, z axis, and origin relative to
@@ -171,7 +181,7 @@ class Tree(
     - `row`, `depth` (6 + n,): the offset of each row, and the number of its entries before the
       diagonal.
     - `path`: the column of each entry.
-    - `common` (6 + n, 6 + n): for each two rows, the number of columns that they have in common.
+    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that both contain.
     - `target`, `share`: one value for each pair of a body and a body on its path to the base,
       including the body itself. `target` is the entry of M to which the pair contributes, and
       `share` is the factor of this contribution. After the pairs of a body, one further value
@@ -242,7 +252,7 @@ def batch_tree(robot: Robot) -> Tree | None:
             above = parent[above]
         target.append(row[coordinate[body]])
         share.append(factor[body])
-    # Count the coordinates that each two paths have in common.
+    # For each pair of paths, count the coordinates that both paths contain.
     common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
     axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
     wrench_body: list[int] = []

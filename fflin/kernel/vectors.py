@@ -3,8 +3,8 @@
 All functions of the kernel are written in Python. The Python engine calls some of them directly,
 with arrays or lists that have one axis. A function then computes one number at a time, and a
 debugger can step through it. `kernel.machine_code` compiles the same functions, also for arrays
-with a second axis of eight lanes. There, compiled operations replace `load`, `store`, `chosen`,
-`below`, `floor`, `whole`, `root` and `angle`.
+with a second axis of eight lanes. In compiled code, other operations replace `load`, `store`,
+`chosen`, `below`, `floor`, `whole`, `root` and `angle`.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: first the base's rotation and translation in base axes,
@@ -45,7 +45,7 @@ def called(function: F) -> F:
 
 
 def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
-    """Return a decorator for a function that uses NumPy; compiled code calls `loop` instead."""
+    """Return a decorator for a NumPy function, for which compiled code substitutes `loop`."""
 
     def noted(function: F) -> F:
         IN_PLACE[function] = called(loop)
@@ -232,8 +232,8 @@ def cosine_and_sine(x):
     p = -1.38888888888741095749e-03 + z * p
     p = 4.16666666666666019037e-02 + z * p
     cosine = (1.0 - 0.5 * z) + z * z * p
-    # Rotate back by the subtracted multiple of pi/2. Its cosine and sine (even, odd) are (1, 0),
-    # (0, 1), (-1, 0) or (0, -1).
+    # Rotate back by the subtracted multiple of pi/2. The cosine `even` and the sine `odd` of this
+    # multiple are (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * 0.5)
     odd = turns - half - half
     sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))

@@ -64,7 +64,7 @@ _LOOSEST = 1e-2
 
 # The terms with the base's linear velocity cancel in exact arithmetic. Numerically, they leave
 # rounding errors of about 1e-16 of their size. Errors are therefore divided by a scale that
-# includes this fraction of these terms. A larger fraction would hide errors of other terms.
+# includes the following fraction of these terms. A larger fraction would hide other errors.
 _ROUNDING_FRACTION = 1e-3
 
 
@@ -185,10 +185,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 def check_all(
     robot: Robot, models: Iterable[LinearModel], title: str = "", *, tolerance: float | None = None
 ) -> Check:
-    """Check models; for each comparison, keep the row of the model with the largest relative error.
-
-    The error is relative to the tolerance of the comparison.
-    """
+    """Check models, and keep one row per comparison: the row with the largest error / tolerance."""
     if tolerance is not None:
         tolerance = share("tolerance", tolerance)
     worst: dict[tuple[str, str], Row] = {}
@@ -270,9 +267,9 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
 def _output_errors(
     model: Nonlinear, lin: LinearModel, steps: Array, tolerance: float
 ) -> dict[str, float]:
-    """Return the errors of y0, compared with the nonlinear outputs, and of C and D.
+    """Return the errors of y0, C and D.
 
-    C and D are compared with finite differences of the nonlinear outputs.
+    y0 is compared with the nonlinear outputs, C and D with finite differences of these outputs.
     """
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
@@ -286,8 +283,9 @@ def _output_errors(
 
     here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
     errors = {"y0": _largest(lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-    # The errors of a row are relative to its largest derivative, and at least to the rounding error
-    # of y / step divided by the tolerance. A smaller derivative is only noise.
+    # Divide the errors of a row by the row's largest derivative, or by `noise` if this is larger.
+    # `noise` is the rounding error of y / step, divided by the tolerance. So a rounding error alone
+    # does not exceed the tolerance.
     noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
     for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
         largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
@@ -383,7 +381,7 @@ class Scales:
         # to the orbital frame.
         self._v = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         # The mobility of coordinate i is sqrt((M^-1)_ii). The mobility of an input is
-        # sqrt(b^T M^-1 b), where b is the generalised force of the input per unit.
+        # sqrt(b^T M^-1 b), where b is the generalised force of a unit input.
         self.mobility = np.sqrt(np.linalg.inv(M).diagonal())
         lower = B[-self._nv :]
         inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
@@ -393,7 +391,7 @@ class Scales:
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
     ) -> dict[str, float]:
-        """Compare the model with other A and B; return {block: error}, as in "A[q_b, q_m]".
+        """Compare the model with other A and B; return the error of each block "A[q_b, q_m]" etc.
 
         If A and B were computed by finite differences, `steps` (nx,) are the steps of the
         differences. `rounding` is then the rounding error of the differences, divided by the
@@ -449,7 +447,7 @@ class Scales:
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
         # Sizes of the derivatives of the velocity-dependent accelerations over omega_b, v_b and the
-        # joint velocities, at this velocity. The derivatives over omega_b and the joint velocities
+        # joint velocities, at the velocity v. The derivatives over omega_b and the joint velocities
         # also contain the linear velocity of the base.
         turning = rate * np.array([*map(_largest, np.split(unit, (3, 6)))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))

@@ -208,7 +208,7 @@ def equilibrium(
 
 
 class _Balance:
-    """Minimum-norm inputs, in base axes, that balance the forces at a point; residual forces."""
+    """Minimum-norm inputs, in base axes, to balance the forces at a point, and residual forces."""
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -241,8 +241,8 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     """Raise `EquilibriumError` if the motion of a joint or of the base changes the forces.
 
     `drift` (nx,) is the state derivative. Three motions raise the error: a joint that is not a
-    rotor moves, the base moves in an orbital frame, or the base rotates about an axis that is not
-    vertical under gravity.
+    rotor moves, the base moves in an orbital frame, or under gravity, the base rotates about an
+    axis that is not vertical.
     """
     moving = [
         f"{name} at {rate:.3g} {unit}/s"

@@ -84,7 +84,10 @@ def record_of(lin: LinearModel) -> Record:
 
 
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
-    """Write the entries of a model, and their digest if `checksummed`; see `LinearModel.save`."""
+    """Write the entries of a model to a file; see `LinearModel.save`.
+
+    If `checksummed`, the file also contains their digest, except in csv.
+    """
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
         record.write_record(path, entries, checksummed=checksummed)

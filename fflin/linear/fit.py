@@ -70,7 +70,7 @@ def require_same(
     None, only names are compared. If `part` is True, the robot may have further signals.
     """
     robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
-    if part:
+    if part and names != tuple(others):
         others = {name: others[name] for name in names if name in others}
     if names == tuple(others) and units in (None, tuple(others.values())):
         return

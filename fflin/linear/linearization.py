@@ -275,7 +275,7 @@ class Linearizer:
                 np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
-        # A copy or pickle cannot share the work space, so it is made by the constructor.
+        # The work space cannot be shared, so copies and pickles are built by the constructor.
         state, moving = self.prepared.map, self.prepared.moving
         reference = None if self.prepared.own_reference else state.reference
         make = partial(type(self), frame=state.frame, reference=reference, moving=moving)

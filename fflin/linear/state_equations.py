@@ -59,7 +59,7 @@ def assemble(
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
 
-    # Convert the rows of the accelerations, which are still in base axes.
+    # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         # Do not rotate the columns of the base's linear velocity, because they are still zero.
@@ -95,8 +95,8 @@ def _over_rotations(
     """
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn` is nonzero only in orbit. In orbit, omega is always in base axes, so the assignment
-    # in the next condition replaces only zeros.
+    # `by_turn` is nonzero only in orbit, and in orbit, omega is in base axes. So if omega is in
+    # reference axes, the assignment below replaces only zeros.
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)

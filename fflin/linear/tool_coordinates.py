@@ -77,7 +77,7 @@ class ToolCoordinates:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
         self._idx_v = [*map(attrgetter("idx_v"), self.joints)]
         # Ratio of each joint velocity of Pinocchio to the joint velocity of the tool. It differs
-        # from 1 only for modal amplitudes, which Pinocchio scales.
+        # from 1 only for modal amplitudes, which are scaled in Pinocchio's model.
         self._scales: Array = np.array([*map(attrgetter("scale"), self.joints)])
         if tool and kind.stored == "xyzw":
             self._scales[:] = 1.0
@@ -239,7 +239,10 @@ class ToolCoordinates:
 
 
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
-    """Return a tool's coordinates for a robot; raise an error if it cannot be represented."""
+    """Return the coordinates of a tool for a robot.
+
+    Raise an error if the tool is unknown or cannot represent the robot.
+    """
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
@@ -248,7 +251,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement of the root link's centre of mass, with the axes of its inertia."""
+    """Return the placement of a frame on the root link: at its centre of mass, in inertia axes."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):

@@ -355,9 +355,10 @@ class Trajectory(Design):
         The error is infinite if the integration overflows.
         """
         # Errors are divided by the largest velocities and accelerations of the motion. A high
-        # orbital velocity of the base would hide them. Therefore subtract the median velocity of
+        # orbital velocity of the base would hide errors. Therefore subtract the median velocity of
         # the base, which does not change the accelerations (Galilean invariance). A fast wheel
-        # would hide the errors of joints with the same divisor. Therefore each rotor has its own.
+        # would hide the errors of joints with the same divisor. Therefore each rotor has its own
+        # divisor.
         t, u, state = self.t, self.u, self._aba.state
         rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -417,7 +418,7 @@ class Trajectory(Design):
 
     @cached_property
     def cubics(self) -> Array:
-        """Coefficients (2, N - 1, 4, nv) of the displacement within each interval, and of v."""
+        """Coefficients (2, N - 1, 4, nv) of the cubic polynomials for displacement and velocity."""
         q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
         begin = self._aba.accelerations(q, v, self.u_base)
         end = begin[1:]

@@ -72,7 +72,7 @@ def list_robots() -> tuple[str, ...]:
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by its name, or by the path of its file, which is relative to `folder`.
 
-    Bundled names come before paths, and paths come before names in example-robot-data.
+    Bundled names take precedence over paths, and paths over names in example-robot-data.
     """
     instance("robot", robot, (str, os.PathLike), "a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():

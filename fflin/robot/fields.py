@@ -255,14 +255,13 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return the limits that the argument `limits` selects, and all known limits.
+def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
+    """Return the limits that the argument `limits` selects.
 
-    Inputs are saturated only at the selected limits. The text "urdf" in `limits` selects all limits
-    of the robot. Any other entry of `limits` is selected, and replaces the limit of the robot.
+    The text "urdf" in `limits` selects all limits of the robot. Any other entry of `limits` is
+    selected, and replaces the limit of the robot.
     """
-    own, cutting = limits_of(robot), dict[str, Range]()
-    given: dict[str, Range] = {}
+    own, given = dict[str, Range](), dict[str, Range]()
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
     for part in limits if isinstance(limits, list | tuple) and several else [limits]:
         if isinstance(part, str):
@@ -271,10 +270,10 @@ def chosen_limits(robot: Robot, limits: object) -> tuple[dict[str, Range], dict[
                     f"limits is '{part}', expected 'urdf', a largest magnitude, {{input: "
                     "magnitude}, or ['urdf', {input: magnitude}]"
                 )
-            cutting = own
+            own = limits_of(robot)
         elif part is not None:
             given |= _given_limits(part, robot)
-    return cutting | given, own | given
+    return own | given
 
 
 def travel_of(model: pin.Model, joint: Joint) -> Range:

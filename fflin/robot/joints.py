@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -160,7 +161,7 @@ class Coordinates:
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints, in state order."""
-        return tuple(joint.name for joint in self.joints)
+        return tuple(map(attrgetter("name"), self.joints))
 
     @cached_property
     def n(self) -> int:
@@ -297,7 +298,7 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:
-    """Return the joint with an index; raise `ModelError` unless it has one degree of freedom."""
+    """Return joint `index` of a model; raise `ModelError` unless it has one degree of freedom."""
     joint, name = model.joints[index], model.names[index]
     kind = joint.shortname()
     if kind == "JointModelMimic":

@@ -140,8 +140,8 @@ def load(
     if later:
         loaded = welded(loaded, later)
     loaded = loaded.merged(fields)
-    # Omit a warning if each of its joints is locked, is named in `field` of the robot, or mimics
-    # such a joint.
+    # Omit a warning if each of its joints is locked, is named in the robot's field `field`, or
+    # mimics such a joint.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
     for field, names, text in ignored(urdf.joints, found.path.stem):
@@ -422,7 +422,7 @@ def _maker(
 def _built(
     document: TomlFile, key: str, choose: Callable[[dict[str, object]], Callable[..., T]]
 ) -> list[T]:
-    """Build an object from each table of the array `key`; errors begin with file and line.
+    """Build an object from each table of the array `key`; messages begin with file and line.
 
     From the values of a table, `choose` selects the class or function that builds the object.
     """

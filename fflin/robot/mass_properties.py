@@ -12,6 +12,8 @@ identification, IEEE Robotics and Automation Letters 3(1), 2018).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import filterfalse
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -38,8 +40,8 @@ _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 # links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message about motions without kinetic energy names the coordinates that are involved. The
-# component of such a coordinate in the motions, scaled to unit norm, exceeds this value.
+# A message about motions without kinetic energy names the coordinates that are involved. A
+# coordinate is involved if its component, in motions of unit norm, exceeds this value.
 _INVOLVED = 0.1
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
@@ -49,7 +51,7 @@ _ASYMMETRY = 1e-12
 
 def dynamic_parameters(model: pin.Model) -> bytes:
     """Return the mass properties of all bodies as bytes, for a hash of the robot."""
-    return b"".join(body.toDynamicParameters().tobytes() for body in model.inertias.tolist())
+    return np.array([*map(pin.Inertia.toDynamicParameters, model.inertias.tolist())]).tobytes()
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
@@ -151,7 +153,10 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
 
 
 def properties(P: Array) -> tuple[Array, Array, Array]:
-    """Return masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about these centres."""
+    """Return masses (N,), centres of mass (N, 3) and inertias (N, 3, 3) about these centres.
+
+    P (N, 4, 4) contains the pseudo-inertias.
+    """
     mass = P[:, 3, 3]
     com = P[:, :3, 3] / np.where(mass == 0.0, 1.0, mass)[:, None]
     second = P[:, :3, :3] - mass[:, None, None] * com[:, :, None] * com[:, None]
@@ -222,16 +227,15 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
-    sums = sums_of(pieces)
-    names = [*(name for name in pieces if name not in sums), *link_of]
+    names = [*filterfalse(robot.sums.__contains__, pieces), *link_of]
     found = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(link_of.get(name, name) for name in found))
+    return list(dict.fromkeys(map(link_of.get, found, found)))
 
 
-def sums_of(pieces: Mapping[str, Piece]) -> set[str]:
+def sums_of(robot: Robot) -> set[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
-    linked = {each.joint for each in pieces.values() if not each.whole}
-    return {name for name, each in pieces.items() if each.whole and each.joint in linked}
+    linked = {each.joint for each in robot.pieces.values() if not each.whole}
+    return {name for name, each in robot.pieces.items() if each.whole and each.joint in linked}
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
@@ -259,12 +263,11 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     # with inertia, and moves no joint with armature. The test asks only whether a mass or moment is
     # zero. It does not use the value, because rounding errors could then hide such a motion.
     bodies = robot.model.inertias.tolist()[ROOT:]
-    moments = [np.linalg.eigh(body.inertia) for body in bodies]
-    if all(
-        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
-        for body, (values, _) in zip(bodies, moments, strict=True)
-    ):
+    masses = np.array([*map(attrgetter("mass"), bodies)])
+    values, axes = np.linalg.eigh([*map(attrgetter("inertia"), bodies)])
+    if (masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all():
         return ()
+    moments = [*zip(values, axes, strict=True)]
     # Mimic joints follow their leaders. Therefore v = columns @ nu, where nu is the velocity of the
     # base and of the independent joints.
     columns = np.eye(robot.nv)
@@ -273,7 +276,8 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
-    # If M is singular at two random configurations, it is almost surely singular at all of them.
+    # If M is singular at two random configurations, it is almost surely singular at every
+    # configuration.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -311,11 +315,11 @@ def require_inertia(robot: Robot) -> None:
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the matrix (k, nv) that maps v to all velocities that have kinetic energy.
+    """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
 
-    These are the velocities of joints with armature and of centres of mass, and the angular
-    velocities about principal axes with inertia. `moments` are the eigenvalues and eigenvectors of
-    the inertias.
+    These are the rates of joints with armature, the velocities of centres of mass, and the angular
+    velocities about principal axes with inertia. `moments` contains the eigenvalues and
+    eigenvectors of each inertia.
     """
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)

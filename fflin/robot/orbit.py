@@ -162,7 +162,7 @@ class CircularOrbit:
 
 
 def checked_orbit(value: object) -> CircularOrbit | None:
-    """Return the orbit given by an orbit, an altitude [m], a mapping of parameters, or None."""
+    """Convert an orbit, an altitude [m] or a mapping of parameters to an orbit; None stays None."""
     if value is None or isinstance(value, CircularOrbit):
         return value
     if not isinstance(value, Mapping):

@@ -28,7 +28,7 @@ class Output:
 
     @property
     def signals(self) -> list[tuple[str, str]]:
-        """List of (name, unit) for each component; empty if the components are states."""
+        """List with (name, unit) of each component; empty if the components are states."""
         prefix = "/".join(self.frames) + "." * bool(self.frames)
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
@@ -70,7 +70,7 @@ class BasePose(Output):
 
 @dataclass(frozen=True)
 class JointOutput(Output):
-    """Base class of the outputs for joints: the chosen joints, or all joints by default."""
+    """Base class of joint outputs, for chosen joints or by default for all joints."""
 
     joints: tuple[str, ...] | None = None
 

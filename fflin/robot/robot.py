@@ -32,7 +32,7 @@ class Springs(NamedTuple):
     rest: Array
 
     def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) of springs and dampers for positions q_m and rates (.., n)."""
+        """Return the forces (.., n) of springs and dampers at joint positions and rates (.., n)."""
         return self.stiffness * (self.rest - q_m) - self.damping * rates
 
 
@@ -350,6 +350,7 @@ class Robot(Coordinates):
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
     pieces = cached_property(mass_properties.pieces_of)
+    sums = cached_property(mass_properties.sums_of)
 
     @cached_property
     def link_of(self) -> dict[str, str]:
@@ -382,13 +383,15 @@ class Robot(Coordinates):
     @cached_property
     def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) of all joints in state order."""
-        given = (self.stiffness, self.damping, self.rest)
-        return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
+        rows = np.zeros((3, self.n))
+        for row, given in zip(rows, (self.stiffness, self.damping, self.rest), strict=True):
+            row[:] = [given.get(name, 0.0) for name in self.joint_names]
+        return Springs(*rows)
 
     @cached_property
     def mass(self) -> float:
         """Total mass [kg]."""
-        return float(sum(inertia.mass for inertia in self.model.inertias.tolist()[ROOT:]))
+        return float(pin.computeTotalMass(self.model))
 
     def __repr__(self) -> str:
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"

@@ -163,9 +163,10 @@ def draft(robot: Robot, urdf: str) -> str:
 
 
 def _candidates(robot: Robot) -> tuple[str, list[str]]:
-    """Return inputs that the names of links suggest, as TOML comments, and the joints of wheels.
+    """Return suggested inputs as TOML text, and the names of joints that are probably wheels.
 
-    The joints are the names, as TOML strings, of joints that are probably wheels.
+    The inputs follow from the names of links, and are comments in the text. The names of joints are
+    TOML strings.
     """
     model, data = robot.model, robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())

@@ -22,7 +22,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def welded(robot: Robot, lock: Lock) -> Robot:
-    """Return a robot with joints and wheels welded; `lock` gives the positions of the joints."""
+    """Return a robot with joints and wheels welded; `lock` gives their names and positions."""
     bare, asked = robot._bare, requested(lock)
     wheels = {name for name in asked if name in robot.wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}

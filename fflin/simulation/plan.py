@@ -131,11 +131,10 @@ class Plan:
             if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
-        # `known` contains all limits of states and inputs; `limits` contains those at which inputs
-        # saturate.
-        acting, self.known = chosen_limits(robot, options.limits)
+        # Limits {state or input: (least, largest)} at which inputs saturate.
+        self.acting = chosen_limits(robot, options.limits)
         self.limits = saturation(
-            robot, acting, self.q, times.dt, times.sample, pulsed=policy is not None
+            robot, self.acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
         # `initial` contains the inputs (nu,) until the first command arrives. Without a law, they
         # act throughout the run.

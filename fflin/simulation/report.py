@@ -255,7 +255,7 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
 
 def pushed(of: object) -> bool:
     """Return whether a motion or similar object has inputs that exert a force on the base."""
-    return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
+    return not {"F_b", "thrust"}.isdisjoint(map(group_of, input_keys(of)))
 
 
 def motion_report(motion: Motion) -> str:

@@ -235,7 +235,8 @@ class Conserved:
                 potential[i] = self._field.potential(data)
         sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
         scale = sizes.max(axis=0)
-        scale[1] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        for _, stored in self._stored:
+            scale[1] += np.linalg.norm(stored)
         if self._weight is not None:
             energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
         stiffness, _, rest = robot.springs
@@ -379,5 +380,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
 
 def stop_of(message: str) -> int:
     """Return the index in STOPS of the message with which a run ended."""
-    found = (at for at, word in enumerate(STOPS) if word and message.startswith(word))
-    return next(found, len(STOPS) - 1) if message else 0
+    for index, start in enumerate(STOPS):
+        if start and message.startswith(start):
+            return index
+    return len(STOPS) - 1 if message else 0

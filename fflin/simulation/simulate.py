@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from time import perf_counter
 from typing import TypeAlias
 
@@ -20,6 +21,7 @@ from fflin.dynamics.coordinates import state_history
 from fflin.dynamics.state import Frame
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import limits_of
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
 from fflin.simulation.motion import Motion
@@ -229,10 +231,16 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         target = state_history(state, q, v, plan.near, run.t)
     energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
     bound = plan.law and plan.law.policy
+    limits = limits_of(plan.options.robot) | plan.acting
     missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
     drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
     return Motion(
-        **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
+        t=run.t,
+        q=run.q,
+        v=run.v,
+        u=run.u,
+        stopped=run.stopped,
+        engine=run.engine,
         x=x,
         target=target,
         prediction=x[:0] if foresees is None else predict(plan, foresees, x, run.steps),
@@ -254,12 +262,12 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),
-        modes=tuple(joint.name for joint in robot.modes),
-        mode_rotations=np.array([joint.rotation for joint in robot.modes]),
+        modes=tuple(map(attrgetter("name"), robot.modes)),
+        mode_rotations=np.array([*map(attrgetter("rotation"), robot.modes)]),
         steered=plan.steered,
         notes=(*growing(plan.policy), *plan.times.notes, *getattr(bound, "notes", ())),
-        limit_names=tuple(plan.known),
-        limits=np.array(list(plan.known.values())).reshape(-1, 2),
+        limit_names=tuple(limits),
+        limits=np.array(list(limits.values())).reshape(-1, 2),
     )
 
 

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, positive
 from fflin.robot.equipment.assembly import carrier
 from fflin.robot.inputs import ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.mass_properties import Piece, as_inertia, sums_of
+from fflin.robot.mass_properties import Piece, as_inertia
 from fflin.robot.robot import Robot
 
 AXES = "xyz"
@@ -56,7 +56,7 @@ class Parameters(dict[str, Parameter]):
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
-        self._sums = sums_of(self.pieces)
+        self._sums = robot.sums
         of_pieces = (each for item in self.pieces.items() for each in _of_piece(*item))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)

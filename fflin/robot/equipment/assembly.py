@@ -51,7 +51,8 @@ _LIGHTEST = 1e-6
 # of the body.
 _NONE = 1e-14
 
-# Fields of a robot whose keys name joints. A key may also be GROUP.JOINT with one of _GROUPS.
+# Fields of a robot that have joint names as keys. A key may also be GROUP.JOINT, with a group of
+# _GROUPS.
 _BY_NAME = (
     *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
     *("point", "target", "start"),
@@ -180,7 +181,7 @@ class Mounted(NamedTuple):
 
 
 def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
-    """Return a model with new joints for `parts`, and with the inertias `bodies` of the old joints.
+    """Return a model with new joints for `parts`; the old joints get the inertias `bodies`.
 
     A new joint comes after all joints that its carrier already carries.
     """
@@ -248,17 +249,20 @@ def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
     Each entry is (index of the joint, angular momentum (3,) [N m s] in the axes of the joint).
     """
     stored: dict[int, Array] = {}
-    for _, wheel in named_wheels(robot.inputs):
-        if wheel.momentum:
+    for wheel in robot.inputs:
+        if isinstance(wheel, ReactionWheel) and wheel.momentum:
             joint, axis = carrier(robot.model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
-    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
+    return tuple(zip(stored, map(frozen, stored.values()), strict=True))
 
 
 def _mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
-    """Return a mounted body for each wheel with inertia, and subtract it from its carrier."""
+    """Return a mounted body for each wheel with inertia.
+
+    The inertia of the wheel is subtracted from its carrier in `bodies`.
+    """
     parts = []
     for name, wheel in named_wheels(inputs):
         if not wheel.inertia:
@@ -313,7 +317,10 @@ def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
 def _mounted_modes(
     model: pin.Model, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
-    """Return a mounted body for each mode, and subtract it from its carrier."""
+    """Return a mounted body for each mode.
+
+    The inertia of this body is subtracted from its carrier in `bodies`.
+    """
     parts = list[Mounted]()
     of_body: dict[int, list[tuple[Appendage, pin.SE3, Array]]] = {}
     for item in appendages:
@@ -360,11 +367,11 @@ def _mounted_modes(
 
 
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
-    """Return {mode: effective masses and moments of inertia (6,)} along the frame's axes.
+    """Return the effective masses and moments of inertia (6,) of each mode, as {mode: values}.
 
-    Each value is a fraction of the corresponding mass or moment of the rigid inertia, about the
-    origin of the appendage's frame. The rigid inertia is from the file of the appendage. If there
-    is no file, the body that carries the appendage has the rigid inertia.
+    The values are along the axes of the appendage's frame and about its origin. Each value is a
+    fraction of the corresponding mass or moment of the rigid inertia. The rigid inertia is from the
+    file of the appendage. If there is no file, it is the inertia of the carrying body.
     """
     found: dict[str, Array] = {}
     for item in appendages:
@@ -447,10 +454,11 @@ def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Arra
 def _ball(
     joint: int, body: pin.Inertia, name: str, column: Array, p: Array, lighter: float = 1.0
 ) -> Mounted:
-    """Return the ball of a mode; `column` (6,) is the participation about the body's origin.
+    """Return the ball that models a mode (16.4).
 
-    `p` (3,) is the origin of the appendage's frame. `lighter` is the ball's mass as a fraction of
-    the mass with which its joint needs no rotor inertia (16.4).
+    `column` (6,) is the mode's participation about the body's origin. `p` (3,) is the origin of the
+    appendage's frame. `lighter` is the ball's mass as a fraction of the mass (16.4), with which the
+    joint needs no rotor inertia.
     """
     # Compute the participation (t, r) about the origin of the appendage's frame. About this point,
     # a mode that only translates has r = 0.
@@ -484,8 +492,8 @@ def _ball(
     else:
         axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
         origin, motion = center, pin.JointModelPZ()
-    # A lighter ball has S^T I S > 1. A negative rotor inertia restores the modal mass of 1:
-    # S^T I S + rotor = 1.
+    # A ball that is lighter than in (16.4) has S^T I S > 1. A negative rotor inertia restores the
+    # modal mass of 1: S^T I S + rotor = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)

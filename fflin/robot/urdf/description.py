@@ -18,12 +18,12 @@ FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floatin
 # Value that stands for a missing limit in the Pinocchio model.
 UNLIMITED = sys.float_info.max
 
-# Largest coordinate of an <origin>. For a length of 1e8 m, adding 1 m^2 to its square changes
-# nothing in double precision. Adding the moments of inertia of the links would also change nothing,
-# and ABA would divide zero by zero.
+# Largest coordinate of an <origin>. At 1e8 m, adding 1 m^2 to the square of the length does not
+# change it in double precision. The moments of inertia of links would be lost in such sums, and ABA
+# would divide zero by zero.
 _FARTHEST = 1e7  # [m]
 
-# Tolerance of the length of a quaternion. Many files give only four digits.
+# Tolerance of the length of a quaternion. It is large, because many files give only four digits.
 _QUATERNION_SLACK = 1e-3
 
 # An axis whose length is outside these bounds is an error in the file.
@@ -34,8 +34,8 @@ _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 _NEGATIVE_SLACK = 1e-9
 
 # CAD programs may give a point mass a small inertia of either sign, which is only a rounding error.
-# A negative inertia counts as such an error if it is at most the mass times the square of this
-# length.
+# A negative inertia counts as such an error if its magnitude is at most the mass times the square
+# of this length.
 _POINT = 1e-6  # [m]
 
 # A link and all links that are fixed to it form one rigid body. A negative principal moment of the
@@ -339,7 +339,8 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
     `moments` are sorted in increasing order.
     """
     # A body whose mass is within the radius r of its centre has moments of at most mass * r^2.
-    # Negative moments up to this bound with r = _POINT are rounding errors of a point mass.
+    # A negative moment is a rounding error of a point mass if its magnitude is at most this bound
+    # with r = _POINT.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 

@@ -126,10 +126,11 @@ def _uses_xacro(element: Element) -> bool:
 def ignored(
     joints: Mapping[str, JointElement], origin: str
 ) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """Yield (field, joints, warning) for damping, friction and zero limits that fflin ignores.
+    """Yield a warning (field, joints, text) for each property of joints that fflin ignores.
 
-    The warning is unnecessary if the robot has a field of this name that contains all of these
-    joints. A robot has the fields "damping" and "passive", but no field "friction".
+    The properties are damping, friction, and zero limits of effort or velocity. The warning is
+    unnecessary if the robot has a field of this name that contains all of these joints. A robot has
+    the fields "damping" and "passive", but no field "friction".
     """
     moving = [joint for joint in joints.values() if joint.freedom]
     for field, effect in (("damping", "damping"), ("friction", "Coulomb friction")):

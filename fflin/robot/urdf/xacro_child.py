@@ -1,7 +1,7 @@
 """Program that expands one xacro document in an isolated process that does not import fflin.
 
-The program's arguments are the path of the document, the time limit [s], and the folders from which
-to import. Until the program has set these folders, it imports only built-in modules.
+The program's arguments are the path of the document, the time limit [s], and the entries of
+`sys.path`. Until the program has set `sys.path`, it imports only built-in modules.
 """
 
 import sys

@@ -34,7 +34,7 @@ _DECIMAL = re.compile(
 
 @lru_cache(128)  # a file repeats a few names many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
-    """Return the known name that is most similar to `name`, or None if none reaches `cutoff`."""
+    """Return the known name most similar to `name`; None if its similarity is below `cutoff`."""
     import difflib
 
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
@@ -76,7 +76,7 @@ class Element:
         """Return the only child with a tag, or None; raise `UrdfError` for a second child.
 
         If `attributes` are given, they are the known attributes of the child. An unknown attribute
-        of the child raises `UrdfError` if it is similar to a known one, and else causes a note.
+        of the child raises `UrdfError` if it is similar to a known one; otherwise it causes a note.
         """
         found = self.find_all(tag)
         if len(found) > 1:
@@ -104,7 +104,10 @@ class Element:
         return found
 
     def refuse_near_miss(self, *known: str) -> None:
-        """Raise `UrdfError` if the tag of a child is a misspelt known tag."""
+        """Raise `UrdfError` if the tag of a child is a misspelt known tag.
+
+        Other unknown tags are ignored.
+        """
         for child in self.children:
             near = child.tag not in known and ":" not in child.tag
             if near and (meant := nearest(child.tag.lower(), known, 0.85)):
