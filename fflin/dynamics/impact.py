@@ -155,9 +155,9 @@ def struck(
 ) -> Impact:
     """Return the impact after which `parts` (robot, q, v) move together as the robot `whole`.
 
-    The velocity solves (13.1). The `impulse` of the result stacks M times the lost velocity of each
-    part in Pinocchio's order, which is minus the generalised impulse on this part. The names of the
-    second part begin with `prefix` in `whole`.
+    The velocity just after the impact solves (13.1). For each part, the `impulse` of the result
+    contains M (v_before - v_after) in Pinocchio's order, which is minus the generalised impulse on
+    the part. In `whole`, the names of the second part begin with `prefix`.
     """
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]

@@ -174,8 +174,8 @@ def held_derivatives(
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     """Return the integral of e^(F^T t) W e^(F t) over [0, h]; F and h may have leading axes."""
-    # In a matrix exponential, the rounding errors of all blocks are relative to the largest block.
-    # So W is scaled to the size of F.
+    # W is a block of the matrix below, whose exponential is computed. The rounding errors of all
+    # blocks of an exponential are relative to its largest block. So W is scaled to the size of F.
     from scipy.linalg import expm
 
     h, n = np.asarray(h)[..., None, None], F.shape[-1]

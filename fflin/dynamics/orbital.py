@@ -123,10 +123,10 @@ class OrbitField:
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
-        """Return the derivatives (nv, nv) of the generalised force of `wrenches` over q.
+        """Return derivatives (nv, nv) of the generalised force of `wrenches` with respect to q.
 
         Only the wrenches vary with q. The Jacobians of the bodies are held constant, because the
-        ABA derivatives include their change. The derivatives over the base position are zero here,
+        ABA derivatives include their change. The columns for the base position are zero here,
         because `add_turning` adds the effect of this position.
         """
         # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body, in its
@@ -236,8 +236,8 @@ class GravityGradient(NamedTuple):
         """Return the generalised force P (nv,) of the field at q, with its derivatives (14.4).
 
         The base of q must be at the origin, so that P excludes the free fall of the base's origin.
-        The derivatives are (nv, nv) over q, with the field constant in base axes, and (nv, 3) over
-        rotations of the base.
+        The first derivatives (nv, nv) are with respect to q, with the field constant in base axes.
+        The others (nv, 3) are with respect to rotations of the base.
         """
         total, v, at_rest = np.zeros((3, model.nv))
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))

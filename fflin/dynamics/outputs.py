@@ -27,9 +27,9 @@ class Sensed(NamedTuple):
     """
 
     y: Array
-    by_q: Array  # over the tangent displacement of pin.integrate
+    by_q: Array  # with respect to the tangent displacement of pin.integrate
     by_v: Array
-    by_a: Array  # over the acceleration a
+    by_a: Array  # with respect to the acceleration a
 
     def part(self, rows: slice) -> Sensed:
         """Return views of some rows, such as the rows of one output."""

@@ -181,7 +181,8 @@ class AccelerationDerivatives(NamedTuple):
     """
 
     c: Array  # (.., 6 + n): without gravity and omega_b x v_b, see (3.2)
-    slopes: Array  # (.., 6 + n, 12 + 2 n) over displacements of the state in base axes
+    # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state in base axes.
+    slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
     gravity: Array  # (.., 3) in base axes
 
@@ -300,10 +301,11 @@ class Accelerations:
 
         - the wrenches on all joints, to which the gyroscopic torques are added;
         - the generalised force (nv,) of the gyroscopic torques;
-        - the derivatives (nv, nv) of this force over q and over v.
+        - the derivatives (nv, nv) of this force with respect to q;
+        - the derivatives (nv, nv) of this force with respect to v.
 
-        The derivatives over q exclude the change of the Jacobian, because the derivatives of RNEA
-        with these wrenches already include it.
+        The derivatives with respect to q exclude the change of the Jacobian, because the
+        derivatives of RNEA with these wrenches already include it.
         """
         model, data, nv = self._model, self._data, len(v)
         # With the angular Jacobian J of a link in the axes of the link, the torque h x omega has

@@ -391,9 +391,9 @@ class Actuation:
         self.groups: dict[str, list[int]] = {}
         columns: list[Array] = []
         held: list[slice] = []
-        # Thrusters, and wheels that are modelled without a joint of their own, by the joint on
-        # which they are mounted. Each item is (index of the input, wrench (6,) of a unit input in
-        # the frame of this joint).
+        # {joint: inputs that are mounted on it}, for thrusters and for wheels that are modelled
+        # without a joint of their own. Each input is (its index, wrench (6,) of a unit input in the
+        # frame of the joint).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in robot.named_inputs:

@@ -158,8 +158,8 @@ def _state_cases(
 ) -> Iterator[Case]:
     """Yield test cases at random states, with the results that the policy computes.
 
-    Some states are close to half a turn from the reference or the target, or at the ends of the
-    grid.
+    Some states are close to half a turn from the reference or the target. If K is interpolated,
+    some states are at the ends of the grid or beyond.
     """
     random, n, turning = np.random.default_rng(0), state.robot.n, state.unbounded
     world = StateMap(state.robot, frame=state.frame)

@@ -95,7 +95,7 @@ def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 @vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    """Write to `out` the scalar products of the rows (size,) of a with the first entries of b."""
+    """Write to `out` the scalar product of each row (size,) of a and the entries b[:size]."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
@@ -131,7 +131,7 @@ def _write_scaled(source: Array, lane: int, share: float, target: Array) -> None
 
 @vec.compiled_as(_write_scaled)
 def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None:
-    """Write `factor` times one lane of `source` to `target`, as many entries as `target` has."""
+    """Fill `target` with the first entries of one lane of `source`, multiplied by `factor`."""
     target[:] = factor * source[: len(target)]
 
 

@@ -116,7 +116,7 @@ def inwards(work, tree):
         vec.add6(work, packed + tree.target[pair], row)
         pair += 1
     # Write the base's rigid-body block of M: inertia, first moment of mass, and mass of the robot.
-    # It is packed like a chain of six coordinates.
+    # The block is packed as if the six coordinates were a chain of joints.
     m = load(work, inertias)
     hx, hy, hz = vec.get3(work, inertias + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, inertias + 4)
@@ -151,7 +151,10 @@ def factorise(work, tree):
 
 
 def solve_inwards(work, tree, x, first):
-    """Replace the generalised force f, which begins at x[first], by L^-T f after `factorise`."""
+    """Replace the generalised force f by L^-T f; f begins at x[first].
+
+    L is the factor of M, which `factorise` must have written.
+    """
     for k in range(len(tree.row) - 1, -1, -1):
         value, row = load(x, first + k), tree.row[k]
         for t in range(tree.depth[k]):
@@ -160,7 +163,10 @@ def solve_inwards(work, tree, x, first):
 
 
 def solve(work, tree, x):
-    """Replace the generalised force f, which begins at work[x], by M^-1 f after `factorise`."""
+    """Replace the generalised force f by M^-1 f; f begins at work[x].
+
+    `factorise` must have written the factor of M.
+    """
     packed = tree.packed
     solve_inwards(work, tree, work, x)
     for k in range(len(tree.row)):
@@ -172,7 +178,7 @@ def solve(work, tree, x):
 
 
 def invert_factor(work, tree):
-    """Replace L by U = L^-1, and write V = L^-1 D^-1 at `scaled`, after `factorise`."""
+    """Replace the factor L of `factorise` by U = L^-1, and write V = L^-1 D^-1 at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row)):
         row, depth = packed + tree.row[k], tree.depth[k]

@@ -13,10 +13,10 @@ have the following derivatives with respect to the joint positions q and velocit
 
 Here I_i, B_i and f_i are the inertia, the Coriolis matrix and the spatial force of the subtree
 beyond joint i. Let p be the linear momentum of the subtree, and h its stored momentum, which is the
-sum of the momenta of its wheels without inertia. The matrix G = sum m v r^T sums over the mass
-points of the subtree, at the positions r from the joint. For a rotation with the angular velocity
-w, the force part of 2 B w is 2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the
-identity matrix E.
+sum of the momenta of its wheels without inertia. The matrix G is the sum of m v r^T over the mass
+points of the subtree, with the velocities v and the positions r from the joint. For a rotation with
+the angular velocity w, the force part of 2 B w is 2 w x p. The moment part is
+2 (tr(G) E - G) w + w x h, with the identity matrix E.
 
 References
 ----------
@@ -41,7 +41,7 @@ from fflin.kernel.vectors import load, store
 
 
 def _coriolis(work, at, w):
-    """Return 2 B w (moment, force) of a joint's subtree for the angular velocity w."""
+    """Return 2 B w (moment, force), with the Coriolis matrix B of a joint's subtree."""
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
@@ -51,7 +51,10 @@ def _coriolis(work, at, w):
 
 
 def _coriolis_transposed(work, at, along):
-    """Return the moment part of 2 B^T s for a motion vector s; the force part is zero."""
+    """Return the moment part of 2 B^T s for the motion vector s = `along`.
+
+    B is the Coriolis matrix of a joint's subtree. The force part of 2 B^T s is zero.
+    """
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
@@ -72,8 +75,8 @@ def differentiate(work, tree):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
-    # For each joint, write the derivatives of all forces over its position and rate, and the
-    # derivatives of its force over omega_b.
+    # For each joint, write the derivatives of all forces with respect to its position and rate, and
+    # the derivatives of its force with respect to omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         moving = tree.motion + body * MOTION
@@ -111,7 +114,7 @@ def differentiate(work, tree):
         vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         bodies.add_column(work, tree.lower + column, width, by_q)
         bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
-    # Write the derivatives of the base's moment and force over omega_b.
+    # Write the derivatives of the base's moment and force with respect to omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
@@ -260,9 +263,9 @@ class RowAccelerations:
     ) -> tuple[Array, Mask]:
         """Write the derivatives of the accelerations c; return c (N, 6 + n) and the mask.
 
-        The derivatives over displacements of the state are written to the lower half of each matrix
-        in A (N, nx, nx), and D_u to `by_u`. Both arrays are C-contiguous. nu and u are in base
-        axes.
+        The derivatives with respect to displacements of the state are written to the lower half of
+        each matrix in A (N, nx, nx), and D_u is written to `by_u`. A and `by_u` are C-contiguous.
+        nu and u are in base axes.
         """
         force = u @ self._actuation.fixed.T
         force[:, 6:] += self.state.robot.springs.force(q_m, nu[:, 6:])
