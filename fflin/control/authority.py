@@ -25,7 +25,7 @@ _AXES = "xyz"
 
 
 class WheelMomentum(NamedTuple):
-    """Total momentum of a robot's wheels in base axes, and the momentum that they can store."""
+    """Total momentum of a robot's wheels in base axes, and the wheels' momentum capacity."""
 
     wheels: int
     total: Array  # (3,) [N m s]
@@ -49,10 +49,10 @@ class WheelMomentum(NamedTuple):
 
 
 class ThrusterAuthority(NamedTuple):
-    """Force and torque that the thrusters alone can produce in every direction.
+    """Largest force and largest torque that the thrusters alone can produce in every direction.
 
-    `least_force` and `least_torque` are None if the thrusters cannot produce every wrench, if a
-    thruster has no limit, or if there are more than _MANY thrusters.
+    `least_force` and `least_torque` are None in three cases: the thrusters cannot produce every
+    wrench, a thruster has no limit, or there are more than `_MANY` thrusters.
     """
 
     thrusters: int
@@ -105,7 +105,7 @@ class PointProperties(NamedTuple):
 
 def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
     """Return the mass properties, the wheel momentum and the thruster authority at q and v."""
-    # With the base at the origin, world axes are base axes.
+    # If the base has its neutral pose, base axes are equal to world axes.
     data, q = robot.create_data(), np.concatenate((robot.neutral()[:7], q[7:]))
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center, inertia = data.com[0].copy(), np.array(data.Ig.inertia)
@@ -114,7 +114,7 @@ def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
 
 
 def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
-    """Return the wheels' total momentum relative to their carriers, and their momentum capacity."""
+    """Return the wheels' momentum relative to their carriers, and the wheels' momentum capacity."""
     limits, wheels, axes = limits_of(robot), named_wheels(robot.inputs), np.zeros((0, 3))
     stored, largest = np.zeros((2, len(wheels)))
     for k, (name, wheel) in enumerate(wheels):
@@ -131,9 +131,9 @@ def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
 
 
 def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:
-    """Return the authority of the thrusters about the centre of mass `center` (3,).
+    """Return the force and the torque about `center` (3,) that the thrusters can produce.
 
-    The base must be at the origin in q.
+    `center` is the centre of mass. The base must have its neutral pose in q.
     """
     actuation = Actuation(StateMap(robot))
     thrusters = actuation.groups.get("thrust", ())
@@ -154,7 +154,8 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:
     """Return whether inputs can produce every wrench.
 
-    The columns of W (6, k) are the wrenches of unit inputs. `pushing` inputs cannot be negative.
+    The columns of W (6, k) are the wrenches of unit inputs. `pushing` (k,) is True for inputs that
+    cannot be negative.
     """
     from scipy.optimize import nnls
 
@@ -166,7 +167,7 @@ def gives_every_wrench(W: Array, pushing: Mask) -> bool:
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Return whether the inputs of a robot, including thrusters, can produce every wrench.
+    """Return whether all inputs of a robot together, with its thrusters, can produce every wrench.
 
     Return False if the robot has no thrusters.
     """
@@ -179,16 +180,16 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
-    r"""Return the largest magnitude that the wrench of the inputs can have in every direction.
+    r"""Return the largest magnitude r of wrench that the inputs can produce in every direction.
 
-    This is the largest r such that, for every unit vector d, there are inputs u within their limits
-    with ``W u = r kept d``. The columns of the matrix `kept` span the directions.
+    The directions are the vectors ``kept d`` with unit vectors d. For each of them, some inputs u
+    within their limits satisfy ``W u = r kept d``, and r is the largest number with this property.
 
     The wrenches ``W u`` of inputs between `low` and `high` form a zonotope
-    :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`.
-    The normal n of each facet is orthogonal to m - 1 independent columns of W. The distance of the
-    facet from the origin, in the subspace spanned by the columns of `kept`, is
-    :math:`h(n) / |kept^T n|`. The least of these distances is r.
+    :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`,
+    where :math:`W_i` is column i of W. The normal n of each facet is orthogonal to m - 1
+    independent columns of W. In the subspace spanned by the columns of `kept`, the distance of the
+    facet from the origin is :math:`h(n) / |kept^T n|`. The smallest of these distances is r.
 
     Parameters
     ----------
@@ -197,7 +198,7 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     low, high : ndarray (k,)
         Limits of the inputs, with ``low <= 0 <= high``.
     kept : ndarray (m, d)
-        Orthonormal columns that span the directions of the wrench.
+        Orthonormal columns, which span the subspace of the directions.
     """
     scale = np.linalg.norm(W, axis=1)
     columns = W / scale[:, None]

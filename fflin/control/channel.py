@@ -1,4 +1,4 @@
-"""Channel from command to actuator: sample and hold, delay, limits, wheels and thruster pulses."""
+"""Channel from command to actuator: sample and hold, delay, limits and thruster pulses."""
 
 import math
 import warnings
@@ -20,7 +20,7 @@ Inputs: TypeAlias = Callable[..., Array]
 
 
 class Saturation(NamedTuple):
-    """Input limits, wheel speed limits and thruster pulses that change the commands."""
+    """Input limits, wheel speed limits and thruster pulses, which change the commands."""
 
     low: Array  # (nu,)
     high: Array
@@ -29,7 +29,10 @@ class Saturation(NamedTuple):
 
     @property
     def cuts(self) -> bool:
-        """Whether inputs may differ from continuous commands, which are never pulsed."""
+        """Whether a limit may change a continuous command.
+
+        Pulses are ignored, because pulsed thrusters need sampled commands.
+        """
         return bool(np.isfinite((self.low, self.high)).any() or len(self.wheels.at))
 
 
@@ -38,8 +41,8 @@ def saturation(
 ) -> Saturation:
     """Return the saturation at q, for integration steps of dt [s] and `sample` steps per sample.
 
-    `sample` is 0 for continuous commands. `pulsed` is True if pulsed thrusters must realise the
-    commands.
+    `sample` is 0 for continuous commands. If `pulsed` is True, pulsed thrusters realise their
+    commands by pulses; otherwise, their thrust is continuous.
     """
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
@@ -88,7 +91,7 @@ def saturation(
 def warn_beyond(
     robot: str, where: str, units: Mapping[str, str], asked: Array, low: Array, high: Array
 ) -> None:
-    """Warn about inputs whose commands `asked` (N, nu) exceed their limits.
+    """Warn about inputs whose commands `asked` (N, nu) are not between `low` and `high` (nu,).
 
     `units` maps the name of each input to its unit.
     """
@@ -109,13 +112,13 @@ def warn_beyond(
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """Call a policy with copies of q and v, and check its command (nu,)."""
+    """Function that calls a policy with copies of q and v, and checks its command (nu,)."""
 
     policy: Callable[[float, Array, Array], object]
     names: tuple[str, ...]
     limits: tuple[Array, Array]
-    # If the squared velocity exceeds this, the motion counts as diverging, and a command that is
-    # not finite raises no error.
+    # If the squared norm of v exceeds this, the motion counts as diverging. A command that is not
+    # finite then raises no error.
     slow: float
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -143,7 +146,8 @@ class Law:
 def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
     """Return the kernel's channel for limits, a sample time [steps] and a delay [steps].
 
-    The inputs `initial` (nu,) are applied until the first command arrives.
+    Until the first command arrives, the channel applies the inputs `initial` (nu,), saturated at
+    their limits.
     """
     slots = delay // sample + 1 if sample else 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
@@ -163,10 +167,10 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 def channelled(
     law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
 ) -> Inputs:
-    """Return the function f(step, *point) of the inputs that a channel applies in a step.
+    """Return a function f(step, *point) that returns the inputs (nu,) after a channel.
 
-    `law` and `speeds` are called with the arguments `point`. `speeds` returns the speeds (k,) of
-    the wheels whose speed is limited.
+    f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds (k,) of the
+    wheels whose speed is limited.
     """
     wheels, u = len(limits.wheels.at), initial.copy()
     if not (sample or limits.cuts):

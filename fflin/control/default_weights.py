@@ -15,34 +15,36 @@ from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
 
-# Bandwidth [rad/s] of a loop if no limit reduces it; the loop settles in about 30 s. If the inputs
-# are held for h seconds, the rate of the fastest mode is at most _HELD / h.
+# Nominal bandwidth [rad/s], with which a loop settles in about 30 s. Limits may reduce it. If the
+# inputs are held for h seconds, the frequency of the fastest mode is at most _HELD / h [rad/s].
 BANDWIDTH, _HELD = 0.2, 0.3
 
-# The robot must return within its limits from these displacements: a rotation of the base [deg],
-# an offset of the base in radii of gyration, and a joint displacement [rad] or [m]. A joint
-# displacement is at most the fraction TRAVEL of the joint's position limit.
+# Design displacements, from which the robot must return without exceeding a limit: the ROTATION of
+# the base [deg], its OFFSET in radii of gyration, and the ANGLE [rad] or LENGTH [m] of a joint. A
+# joint displacement is at most TRAVEL times the joint's position limit.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# The bandwidth is at least the fraction _OF_GROWTH of the growth rate of an unstable mode. Effort
-# limits may reduce it to the fraction _LEAST_OF_GROWTH. With a lower bandwidth, joints with a small
-# inertia would swing by radians.
+# If a mode is unstable, the bandwidth is at least _OF_GROWTH times the growth rate of the mode.
+# Effort limits may reduce the bandwidth to _LEAST_OF_GROWTH times this rate. With a lower
+# bandwidth, joints with a small inertia would swing by radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# Least effect of the inputs on a mode, relative to the effort that holds the mode at rest. A
-# smaller effect is raised to this value. Such a mode keeps the decay that it has without feedback.
+# The weight on velocities (10.8) assumes that the effect S R^-1 S' of the inputs is, in every
+# direction, at least this fraction of D (10.7). A mode with a smaller effect keeps its open-loop
+# decay.
 _LEAST_REACH = 1e-3
 
-# An effect of the inputs on a coordinate counts as zero if its ratio to the inertia is below this.
+# The inputs count as having no effect on a coordinate if the diagonal entry of S R^-1 S' for the
+# coordinate is at most this times the entry of D (10.7).
 _IDLE = 1e-12
 
-# Largest number of iterations for the bandwidth of a robot with dampers. The bandwidth is iterated
-# because the effect of a damper depends on it.
+# Largest number of iterations for the bandwidth of a robot with dampers. Iterations are needed,
+# because the bandwidth depends on the inertia M + B / w, which depends on the bandwidth w.
 _PASSES = 4
 
-# Largest number of bandwidths that are tried for a loop with springs or gravity. If all of them
-# exceed an effort limit, the highest bandwidth is chosen among those whose factor `left` is at
-# least _IN_VAIN times the largest factor.
+# Largest number of bandwidths that `_slowed` tries. If an effort limit is exceeded at all of them,
+# `_slowed` chooses the highest bandwidth whose factor `left` is at least _IN_VAIN times the largest
+# factor, because a lower bandwidth would hardly reduce the excess.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # The report names a mode if its decay rate is below this fraction of the nominal decay rate, which
@@ -52,22 +54,23 @@ _AS_SLOW = 0.9
 _NOT_ENOUGH = "is too small for all displacements"
 
 
-# Weights Q (nx, nx) and R (nu, nu), their rule, the bandwidth of the loop, and the costs (nx + nu,)
-# of the largest states and inputs.
+# Weights Q (nx, nx) and R (nu, nu), a description of their rule, the bandwidth of the loop, and the
+# costs (nx + nu,): the contribution of each state and input to the cost at its largest value. The
+# rate of a coordinate has the cost of the coordinate.
 Weights: TypeAlias = tuple[Array, Array, str, float, Array]
 
 
 class Pace(NamedTuple):
-    """Bandwidth that a loop has if no limit reduces it, and scale of its displacements."""
+    """Nominal bandwidth of a loop, size of the displacements, and hold time of inputs."""
 
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0  # factor on the design displacements
     hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
-    held: float = _HELD  # [rad], largest rate of a mode times the hold
+    held: float = _HELD  # [rad], largest frequency of a mode times the hold time
 
 
 class Limit(NamedTuple):
-    """Largest bandwidth [rad/s] that a limit permits, and the description of the limit."""
+    """Bandwidth [rad/s], with a description of the limit or unstable mode that determines it."""
 
     bandwidth: float
     what: str
@@ -76,8 +79,8 @@ class Limit(NamedTuple):
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
     """Return weights with which a displaced robot returns without exceeding its limits (10.7).
 
-    `momenta` maps the name of a wheel's rate to the largest momentum that the inputs may add to
-    the wheel.
+    `momenta` maps the name of each wheel speed to the largest momentum [N m s] that the inputs may
+    add to the wheel.
     """
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
@@ -96,14 +99,14 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return the viscous damping matrix B (m, m), which is zero for a sampled model."""
+    """Return the viscous damping matrix B (m, m) of (10.7), which is zero for a sampled model."""
     m = len(lin.M)
     if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # Gyroscopic coupling and orbital motion do not dissipate energy, so their terms are not
-    # damping.
+    # The damping rates of gyroscopic coupling and of orbital motion sum to zero, because these do
+    # not dissipate energy. If the rates of a model sum to zero, the model counts as undamped.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -114,7 +117,7 @@ def _damping(lin: LinearModel) -> Array:
 def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
-    """Return the weights for an inertia M (m, m) that includes the damping divided by w.
+    """Return the weights for the inertia M (m, m), which includes the damping term B / w of (10.7).
 
     `inverse` (m, m) maps the rates of the coordinates to the velocities of the model.
     """
@@ -128,7 +131,8 @@ def _of_inertia(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
             "it, or give Q and R"
         )
-    # Effect S R^-1 S' of the inputs on the coordinates, which is made positive definite.
+    # Effect S R^-1 S' of the inputs on the coordinates. It is made positive definite, because the
+    # weights contain roots of its eigenvalues.
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
@@ -136,17 +140,17 @@ def _of_inertia(
         reach += np.diag(D)
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
-    # Scale the cost so that the slowest mode has the bandwidth w.
+    # Scale the cost so that the frequency of the slowest mode is the bandwidth w.
     unit = ratios[0]
     cost, reach, ratios = cost * unit, reach / unit, ratios / unit
     to_modes = back @ inverse
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
-    # Gain of a loop with a bandwidth of 1 rad/s.
+    # Gain (nu, m) from coordinates to inputs, for a bandwidth of 1 rad/s.
     gain = (S / cost).T @ np.linalg.solve(reach, back.T @ (ratios[:, None] ** 0.75 * to_modes))
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
-    # Limits on the speeds of the coordinates, and limits on the momenta added to wheels.
+    # `room` contains the limits on the rates of the coordinates, and on momenta added to wheels.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {**momenta}
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
@@ -185,7 +189,7 @@ def _of_inertia(
 def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
-    """Return a function that maps the bandwidth to the weight (m, m) on velocities (10.8)."""
+    """Return a function that maps a bandwidth w to the weight (m, m) on velocities (10.8)."""
     m, X = len(lin.M), rate_matrix(lin)
     size = np.sqrt(least)
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
@@ -206,7 +210,7 @@ def _on_velocities(
 
 
 def displacements(lin: LinearModel, fraction: float) -> Array:
-    """Return the design displacement of each coordinate (m,), scaled by `fraction`."""
+    """Return the design displacements (m,) of the coordinates, multiplied by `fraction`."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
     M, radius, size = lin.M, 1.0, np.empty(m)
@@ -230,12 +234,12 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest speeds (k,) during the return, for a bandwidth of 1 rad/s.
+    """Return the largest speeds (k,) during the return from displacements `size` (m,).
 
-    T (k, m) maps the rates of the modes to the speeds.
+    The bandwidth is 1 rad/s. T (k, m) maps the rates of the modes to the speeds.
     """
-    # The equation of a mode is mass x'' + most x' + rates^2 x = 0. Without damping, `mass` (m,) is
-    # 1; dampers reduce it.
+    # A mode x obeys ``mass x'' + most x' + rates^2 x = 0``. Without dampers, `mass` (m,) is 1. With
+    # dampers, it is smaller.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
@@ -268,9 +272,10 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest entries of ``K d`` over all displacements d of magnitude `size`.
+    """Return the largest magnitude of each entry of ``K d``, over all displacements d.
 
-    Displacements of the base have any direction. Displacements of joints have any sign.
+    The magnitudes of d are `size` (m,). The rotation and the offset of the base may have any
+    direction, and the displacement of each joint any sign.
     """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
@@ -281,10 +286,10 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 
 
 def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
-    """Return the factor on the bandwidth at which each limited signal reaches its limit.
+    """Return, for each limited signal, the bandwidth factor at which the signal reaches its limit.
 
-    The signals have the values `used` at a factor of 1, and grow with the factor to the power
-    `power`.
+    With a factor of 1, the signals have the values `used`. They are proportional to the factor
+    raised to the power `power`.
     """
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
@@ -294,13 +299,13 @@ def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) 
 
 
 def _efforts_left(lin: LinearModel) -> dict[str, float]:
-    """Return the limit of each input minus the input's magnitude at the operating point."""
+    """Return, for each input, its limit minus its magnitude at the operating point."""
     inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
     return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
 def _growth(lin: LinearModel) -> Limit:
-    """Return the largest growth rate [1/s] of the model, and a description of its mode."""
+    """Return the largest growth rate [1/s] of a mode, and a description of this mode."""
     poles, modes = np.linalg.eig(lin.A)
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
@@ -316,15 +321,17 @@ def _slowed(
     limit: Limit,
     least: Limit,
 ) -> tuple[Limit, str]:
-    """Reduce the bandwidth of a loop with springs or gravity until it respects the effort limits.
+    """Reduce the bandwidth of a loop with springs or gravity until the effort limits are satisfied.
 
-    The bandwidth is not reduced below `least`. The efforts at the start of the return are computed
-    for displacements `size` (m,). The efforts during the return are computed for displacements
-    `driven`, which are zero for joints without a motor, because springs or gravity move them. The
-    second result is a description of the achieved loop.
+    The bandwidth starts at `limit` and is not reduced below `least`. The efforts at the start of
+    the return are computed for displacements `size` (m,). The efforts during the return are
+    computed for displacements `driven` (m,). These are zero for coordinates on which no input acts,
+    because only springs or gravity can return such coordinates. The results are the bandwidth and a
+    description of the loop.
     """
-    # Each trial has the factor on its bandwidth at which an effort reaches its limit, the name of
-    # this effort, the bandwidth, a report and the inputs (nu,).
+    # A trial contains the bandwidth factor at which the first effort reaches its limit, the name of
+    # this effort, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
+    # inputs.
     trials = list[tuple[float, str, Limit, str, Array]]()
     for _ in range(_TRIALS):
         Q, R = costs(w := limit.bandwidth)
@@ -356,8 +363,8 @@ def _slowed(
         trials.append((left, effort, limit, said, np.abs(lin.u0) + use))
         if w <= least.bandwidth:
             break
-        # Springs and gravity require efforts even if the loop is very slow, so the bandwidth is
-        # reduced in steps.
+        # Springs and gravity require efforts even if the loop is very slow, so the factor `left` is
+        # only an estimate. The bandwidth is therefore reduced in steps.
         limit = max(Limit(min(max(left, 0.3), 0.8) * w, effort), least)
     if not trials:
         return limit, ""  # the design of the regulator fails and reports the reason
@@ -373,17 +380,17 @@ def _slowed(
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the names of the coordinates with the largest inertia-weighted motion in `modes`."""
+    """Return the names of the coordinates that move most in one of `modes`, weighted by inertia."""
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
     return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
-# Along a trajectory, displacements are _BESIDE times the displacements at a point. The bandwidth
-# is _CONSTANTS / duration, so that the displacements decay within the duration. It is raised to
-# BANDWIDTH if it is lower, and reduced to _FASTEST if it is higher. If the inputs are held,
-# _HELD_ALONG replaces the stricter _HELD, because the sampled regulator includes the hold exactly.
+# Along a trajectory, the design displacements are multiplied by _BESIDE. The bandwidth is
+# _CONSTANTS / duration, so that the displacements decay within the duration, but at least BANDWIDTH
+# and at most _FASTEST [rad/s]. If the inputs are held, _HELD_ALONG replaces the stricter _HELD,
+# because the sampled regulator includes the hold exactly.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 

@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from fflin.linear.exchange import ToolGain
     from fflin.robot.robot import Robot
 
-# The report omits a gain with more entries than this, such as for a robot with more than 3 joints.
+# The report omits a gain with more entries than this. The number is the size of K for a robot with
+# 3 joints and one input for each degree of freedom.
 _LARGE = 9 * 18
 
 # Relative accuracy of the largest gain over frequency.
 ACCURACY = 1e-5
 
-# A loop whose disk margin is below this is called fragile.
+# A disk margin below this gives a warning.
 _FRAGILE = 0.3
 
 
@@ -218,8 +219,8 @@ class Gain(ModelDesign):
 def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:
     """Linearise a robot at the operating point of a gain, with states relative to `reference`.
 
-    If the states or inputs of the robot differ from those of the gain, raise an error whose message
-    begins with `made`.
+    If the robot and the gain have different states or inputs, raise an error whose message begins
+    with `made`.
     """
     from fflin.linear.linearization import linearize
 
@@ -240,7 +241,10 @@ def make_gain(
     N: Array,
     weights: str = "as given",
 ) -> Gain:
-    """Return a model's gain from the Riccati solution of a `part`; other states get zero gain."""
+    """Return the gain of `lin` from the Riccati solution of `part`, a model with fewer states.
+
+    The gain of the other states is zero.
+    """
     S = selection(part.state_names, lin.state_names)
     return Gain._of(
         solution,
@@ -283,7 +287,7 @@ def cautions(gain: Gain) -> list[str]:
 
 
 def _poles(gain: Gain) -> str:
-    """Return a table of the poles, slowest first; pairs and repeated poles appear once."""
+    """Return a table of the poles, slowest first; a conjugate pair or multiple pole has one row."""
     poles = gain.poles[gain.poles.imag >= 0.0]
     rates = rates_of(poles, gain.dt)
     heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
@@ -317,7 +321,7 @@ class Margins(NamedTuple):
 
 
 def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
-    """Return the largest gain over frequency of a stable system, and the frequency [rad/s].
+    """Return the largest gain of a stable system over all frequencies, and its frequency [rad/s].
 
     The gain is accurate to five digits.
     """
@@ -342,9 +346,9 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
     """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and a mask of imaginary ones.
 
-    At the frequency of each imaginary eigenvalue, the gain of the system equals `bound`. The mask
-    may contain an eigenvalue that is not imaginary, which costs one more evaluation of the
-    response.
+    At the frequency of each imaginary eigenvalue, a singular value of the frequency response equals
+    `bound`. The mask may also mark an eigenvalue that is only nearly imaginary. A caller then
+    evaluates the response once more than necessary.
     """
     inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
     F = A + B @ inverse @ D.T @ C

@@ -1,4 +1,4 @@
-"""Kalman filters, which estimate states about a point or along a trajectory, and LQG."""
+"""Kalman filters about a point or along a trajectory, and LQG compensators."""
 
 from __future__ import annotations
 
@@ -426,7 +426,7 @@ def tvkalman(
 def disturbance(
     of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
 ) -> tuple[Array, Array]:
-    """Return the matrix W (nw, nw) of a disturbance, and its input matrix (.., nx, nw)."""
+    """Return the intensity W (nw, nw) and the input matrix G (.., nx, nw) of the disturbance."""
     nx = len(of.state_names)
     if G is None:
         return weight("W", W, of.state_names), np.eye(nx)

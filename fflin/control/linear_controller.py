@@ -27,12 +27,13 @@ from fflin.robot.robot import Robot
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
-# A pole counts as unstable if its growth exceeds this times (1 + the largest pole magnitude).
+# A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds this times
+# (1 + the largest pole magnitude).
 _ROUNDING = 1e-6
 
 
 class System(NamedTuple):
-    """State space A, B, C, D with names of its signals.
+    """State-space system A, B, C, D with the names of its inputs and outputs.
 
     The sample time dt [s] is 0 in continuous time, -1 if it is unknown, and None if not given.
     """
@@ -129,7 +130,8 @@ class LinearController(Feedback):
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = _system_of(self.system)
-        # Expand the system to all outputs and inputs of the model, and multiply it by the sign.
+        # Expand the system to all outputs and inputs of the model, and multiply its output by the
+        # sign of the feedback.
         columns = _indices("input", by.inputs, by.D.shape[1], "output", lin.output_names)
         rows = _indices("output", by.outputs, len(by.D), "input", lin.input_names)
         nz, (nu, ny) = len(by.A), lin.D.T.shape
@@ -207,7 +209,7 @@ class LinearController(Feedback):
 
 
 def growing(policy: object) -> tuple[str, ...]:
-    """Return warnings if a linear controller or its loop with the model has unstable poles."""
+    """Return a warning if a linear controller is unstable, and another if its loop is unstable."""
     said, by = list[str](), decider(policy)
     if not isinstance(by, LinearController):
         return ()
@@ -223,7 +225,7 @@ def growing(policy: object) -> tuple[str, ...]:
 
 
 def closed_loop(policy: object) -> tuple[Array, float] | None:
-    """Return the closed-loop matrix and dt [s], or None if the loop is not linear."""
+    """Return the closed-loop matrix and dt [s] of a linear policy, or None for other policies."""
     (lin, K), by = feedback_of(policy), decider(policy)
     if isinstance(by, LinearController):
         return by.loop, by.dt
@@ -300,13 +302,14 @@ def _system_of(given: Any) -> System:
     inputs = getattr(given, "input_names", getattr(given, "input_labels", ()))
     outputs = getattr(given, "output_names", getattr(given, "output_labels", ()))
     dt = getattr(given, "dt", None)
-    # A system without signal names and with dt = None is a continuous system of SciPy.
+    # Continuous systems of SciPy have dt = None and no signal names. In systems of other tools,
+    # dt = None means that the sample time is not given.
     dt = 0.0 if dt is None and not inputs else dt
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
 def _checked(*given: Any) -> System:
-    """Return the system after a check of its sizes; if A is empty, it is the static gain D."""
+    """Return the system with arrays of consistent sizes; an empty A means a static gain D."""
     *matrices, dt, inputs, outputs = System(*given)
     defaults = (), (), (), 0.0
     A, B, C, D = (
@@ -355,7 +358,7 @@ def _read(path: Path) -> System:
 def _indices(
     kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
 ) -> list[int]:
-    """Return the index in the model of each signal of a controller."""
+    """Return the index of the model's signal that corresponds to each signal of a controller."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(

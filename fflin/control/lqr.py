@@ -22,7 +22,7 @@ from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weig
 from fflin.dynamics.state import selection
 from fflin.linear.model import LinearModel
 
-# A relative residual above _COARSE raises a warning, and one above _USELESS raises an error.
+# A relative residual above _COARSE gives a warning, and a residual above _USELESS raises an error.
 _COARSE, _USELESS = 1e-8, 1e-3
 
 
@@ -251,7 +251,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
 def _diagonal(
     what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
 ) -> Array:
-    """Return the diagonal of a weight for the states `kept`, from a weight for all `names`."""
+    """Return the diagonal of a weight on the states `kept`, from a weight on all states `names`."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(
             f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
@@ -267,7 +267,8 @@ def require_fixed_point(lin: LinearModel) -> None:
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift
-    # Entries of equal size stay in order, although their last digits differ between processors.
+    # Sizes are rounded, because their last digits differ between processors. Entries of equal size
+    # then stay in order.
     sizes = [float(f"{size:.5g}") for size in np.abs(rate).tolist()]
     shown = [
         f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
@@ -284,7 +285,7 @@ def require_fixed_point(lin: LinearModel) -> None:
 
 
 def _difference(a: Array, b: Array, c: Array) -> Array:
-    """Return a - b c, with zeros for entries that are rounding errors."""
+    """Return a - b c, and set entries to zero that are only rounding errors."""
     rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     difference = a - b @ c
     return np.where(np.abs(difference) > rounding, difference, 0.0)
@@ -294,7 +295,8 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array) -> Solution:
     structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
     if structured is not None:
         return structured
-    # If a mode would make a general solver fail, these checks raise an error that names the mode.
+    # If a mode makes the problem unsolvable, these checks raise an error that names the mode. The
+    # general solver would fail without naming it.
     require_stabilizable(lin)
     toward = np.linalg.solve(R, N.T)
     require_weighed(lin, _difference(lin.A, lin.B, toward), _difference(Q, N, toward))

@@ -27,26 +27,27 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
-# Weights Q, R and Qf, and the name of the rule that gives Q and R if they are None.
+# Weights Q, R and Qf, and the rule that gives Q and R if they are None.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
-# Largest number of entries in the matrices that map inputs to states and limits: 160 MB.
+# Largest number of entries of the matrices that map inputs to states and limits. They fill 160 MB.
 _MOST_ENTRIES = 20_000_000
 
-# Settings of DAQP, whose rows are scaled to length 1. _EXACT is the tolerance, relative to the
-# typical width of the limits. _PRICE is the weight of soft limits, and _YIELDS is their
-# regularisation. A relative violation below _VIOLATED is not reported.
+# Settings of the solver DAQP. The rows of the constraints are scaled to length 1. _EXACT is the
+# tolerance and _PRICE the weight of soft-limit violations, both relative to the median width of the
+# limits. _YIELDS is the regularisation of soft limits. If a plan exceeds a soft limit by less than
+# _VIOLATED times this width, the violation is not reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# If the robot exceeds a limit by less than this fraction of the width between the limits, the
-# violation is not reported.
+# If the robot exceeds a limit by less than this fraction of the width between the lower and the
+# upper limit, the violation is not reported.
 _OVER = 1e-3
 
-# The two kinds of soft-limit violations that the notes of a run report.
+# The two kinds of soft-limit violations in the notes of a run.
 _OF_PLANS, _OF_ROBOT = "plans that exceed", "samples at which the robot exceeds"
 
-# Constants of DAQP. _OPEN is its infinity. _SOFT is its code for a soft limit. _SOFTENED is its
-# exit flag for a plan that exceeds a soft limit. _MOST is the largest number of iterations.
+# Constants of DAQP: _OPEN is infinity, _SOFT is the code of a soft limit, and _SOFTENED is the exit
+# flag for a plan that exceeds a soft limit. _MOST is the largest number of iterations.
 _OPEN, _SOFT, _SOFTENED, _MOST = 1e30, 8, 2, 10_000
 
 
@@ -198,7 +199,7 @@ class Mpc(_Predictive):
     gain : Gain
         The regulator that acts if no limit is active.
     horizon : Horizon
-        The stages of the quadratic program.
+        The predicted samples (stages) of the quadratic program, and their limits.
     """
 
     lin: LinearModel
@@ -219,7 +220,7 @@ class TrajectoryMpc(_Predictive, TrajectoryFeedback):
 def _unplanned(
     of: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
 ) -> Horizon:
-    """Return a horizon that has the limits of a model's signals, but no stages."""
+    """Return a horizon with the limits of a model's signals, but no stages."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
@@ -250,7 +251,7 @@ def _unplanned(
 
 
 def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
-    """Design the controller about a point, and compute the stages of the horizon `ahead`."""
+    """Design the controller about a point; `ahead` is its horizon, which has no stages yet."""
     (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = lqr(sampled, *given, weights=weights)
@@ -271,7 +272,7 @@ def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
 
 
 def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
-    """Design the controller along a trajectory, and compute the stages of the horizon `ahead`."""
+    """Design the controller along a trajectory; `ahead` is its horizon, which has no stages yet."""
     (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
@@ -285,8 +286,8 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
         for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
     ]
     for total, step, K, P, of, u in (*designs, last):
-        # The target of the base pose is zero, because its limits apply to the error relative to the
-        # trajectory.
+        # The base pose in x is zero, because limits of the base pose apply to the error relative to
+        # the trajectory.
         x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
         stages.append(ahead.stage(total, step, K, P, of, u, x))
     stages += stages[-1:] * (ahead.samples - 1)
@@ -296,7 +297,8 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
 class Stage(NamedTuple):
     """One predicted sample: ``e' = A e + B d`` with ``d = u - u*``, and limits on ``E e' + D d``.
 
-    e and e' are the errors at the start and at the end of the sample. Input limits come first.
+    e and e' are the errors at the start and at the end of the sample, and u* are the reference
+    inputs. The rows of the input limits come first in E and D.
     """
 
     A: Array  # (nx, nx)
@@ -327,7 +329,7 @@ class Matrices(NamedTuple):
     inputs : tuple of str
         Names "name[k]" of the entries of d.
     limits : tuple of str
-        Names of the rows of G; limits of states and outputs apply at the end of sample k.
+        Names "name[k]" of the rows of G. Limits of states and outputs apply at the end of sample k.
     """
 
     H: Array
@@ -343,10 +345,10 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return matrices that map inputs and the initial error to errors, z and limited values.
+    """Return three matrices, which predict the errors, z and the limited values over N stages.
 
     z is the scaled difference between the inputs d and the inputs -K e of the regulator, so that
-    ``d = L z - K e``. The matrices have N nu + nx columns. The first N nu columns multiply z if
+    ``d = L z - K e``. Each matrix has N nu + nx columns. The first N nu columns multiply z if
     `planned` is True, and d otherwise. The last nx columns multiply the initial error.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
@@ -364,7 +366,7 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Stages of all samples of a run, with their limits; each plan covers N samples."""
+    """Predicted samples (stages) about a point or along a trajectory; each plan covers N stages."""
 
     stages: tuple[Stage, ...]
     samples: int  # N
@@ -379,10 +381,12 @@ class Horizon:
     def stage(
         self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
     ) -> Stage:
-        """Return the stage of a sample with cost `total`, transition `whole` and gain K.
+        """Return the stage of a sample with the gain K.
 
-        P is the cost at the end of the sample. The limits are relative to the input `u`, the state
-        `x`, and the output of the model `of`.
+        `total` (nx + nu, nx + nu) is the cost matrix of the error and the input, and `whole`
+        (nx, nx + nu) maps them to the next error. P is the cost matrix at the end of the sample.
+        The limits of the stage are relative to the input `u`, the state `x` and the output
+        ``of.y0``.
         """
         (nx, nu), there = of.B.shape, np.concatenate((u, x, of.y0))[self.at]
         A, B = np.split(whole, [nx], axis=1)
@@ -392,12 +396,12 @@ class Horizon:
         return Stage(A, B, K, L, E, D, self.low - there, self.high - there)
 
     def window(self, t: float) -> tuple[Stage, ...]:
-        """Return the stages of N samples from time t on, or of the last N samples."""
+        """Return the N stages from time t on, or the last N stages if fewer remain."""
         k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
         return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
-        """Return the lower and upper limits (m,) of stages, and a mask of the soft limits."""
+        """Return the lower limits, the upper limits and a mask of the soft limits, each (m,)."""
         soft = np.tile(self.at >= len(self.inputs), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
@@ -406,14 +410,14 @@ class Horizon:
 class Receding:
     """Policy that applies the first input of each plan.
 
-    `at(t, q, v)` returns the inputs u* of the reference and the error e.
+    `at(t, q, v)` returns the reference inputs u* and the error e.
     """
 
     def __init__(self, horizon: Horizon, at: Deviation) -> None:
         self.of, self._at, self._last = horizon, at, -np.inf
         self.solves = self.unfinished = 0
-        # For each kind of soft-limit violation: the number of violations, and the magnitude and
-        # description of the largest.
+        # For each kind of soft-limit violation: the number of plans or samples with a violation,
+        # and the relative magnitude and the description of the largest violation.
         self._violations = dict.fromkeys((_OF_PLANS, _OF_ROBOT), (0, 0.0, ""))
         self._due: tuple[Stage, Array] | None = None  # the last sample and its input
         if horizon.limited:  # now, so that the first sample is not slower
@@ -444,7 +448,7 @@ class Receding:
         return command
 
     def step(self, t: float, e: Array) -> Array:
-        """Return the command minus the reference inputs (nu,), for the error e (nx,)."""
+        """Return the command (nu,) minus the reference inputs, at a sample with error e (nx,)."""
         stages = self.of.window(t)
         now, d = stages[0], -stages[0].K @ e
         if not self.of.limited:
@@ -486,9 +490,10 @@ class Receding:
         return d
 
     def _record(self, what: str, t: float, excess: Array, unit: Array, least: float) -> None:
-        """Record violations of soft limits in the samples from time t [s] on.
+        """Count a plan or sample that violates a soft limit, and record the largest violation.
 
-        An excess counts as a violation if the product of `excess` and `unit` is above `least`.
+        A soft limit is violated if the product of `excess` and `unit` is larger than `least`. The
+        first entries of `excess` belong to the sample that starts at time t [s].
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
         row, (count, most, said) = int(fractions.argmax()), self._violations[what]

@@ -24,11 +24,12 @@ from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
 from fflin.robot.robot import Robot
 
-# Largest error [rad, m, s] at the goal, and largest violation of state limits at the knots.
+# Largest permitted error at the goal, and largest permitted violation of a state limit at a knot
+# [rad, m, s].
 _REACHED = 1e-7
 
-# A warning is given if the motion exceeds a limit by more than the fraction _BETWEEN. The motion is
-# checked at the ends of _PARTS equal parts of each interval.
+# A warning is given if the motion exceeds a limit by more than _BETWEEN times the limit. The motion
+# is checked at the ends of _PARTS equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
 
 
@@ -158,8 +159,8 @@ def plan(
     _require_within(shooting, bounds, "goal", end, asked)
     # NumPy's warnings are not needed, because an error is raised if the search diverges.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
-        # Weights of the knots in the integral of the effort: the hold times of held inputs, or the
-        # weights of the trapezoidal rule.
+        # Weights of the knots in the integral of the effort: the hold times if the inputs are held,
+        # otherwise the weights of the trapezoidal rule.
         h, inputs = shooting.h, np.array((low, high))
         held = np.append(h, h[-1] if shooting.held else 0.0)
         held = held if shooting.held else 0.5 * (held + held[::-1])
@@ -194,14 +195,14 @@ class _Made(NamedTuple):
 
     @property
     def reached(self) -> bool:
-        """Whether the motion ends at the goal, and its knots are within the limits."""
+        """Whether the motion ends at the goal and is within the limits at the knots."""
         return max(self.missed.max(), self.at_knots.max()) <= _REACHED
 
 
 def _least(search: Search) -> _Made:
-    """Search for a plan of least effort, and return the attempt with the smallest violations.
+    """Search for a plan of least effort, and return the attempt with the smallest violation.
 
-    Attempts that reach the goal have priority.
+    An attempt that reaches the goal has priority over an attempt that does not.
     """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)
@@ -226,7 +227,10 @@ def _least(search: Search) -> _Made:
 def _require_within(
     shooting: Shooting, bounds: Array, what: str, point: Point, asked: Mask
 ) -> None:
-    """Raise `InputError` if one of the states `asked` of a point is outside its limits."""
+    """Raise `InputError` if a state of a point is outside its limits.
+
+    `asked` (nx,) is True for the states to check.
+    """
     values, state = shooting.limited_values(*point), shooting.state
     outside = [
         f"{state.names[i]} is {values[i]:.4g} {state.units[i]}, limit {limit:.4g} {state.units[i]}"
@@ -239,7 +243,7 @@ def _require_within(
 
 
 def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
-    """Return the error for a failed search; it names the largest violations of the last trial."""
+    """Return the error for a failed search, with the largest violations of the last trial."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     by = [
@@ -277,7 +281,7 @@ def _note(shooting: Shooting, made: _Made) -> str:
 
 
 def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Array) -> str:
-    """Describe the state or input of each group that is nearest to its limit.
+    """Describe, for each group of signals, the state or input that is nearest to its limit.
 
     `limits` (2, k) contains the lower and upper limits of all states and inputs.
     """

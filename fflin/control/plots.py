@@ -25,8 +25,8 @@ _POINTS = 400
 # would overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
-# A gain factor below this counts as zero. Such a factor occurs because an integrator has infinite
-# gain at zero frequency.
+# A gain factor below this counts as zero. Such factors occur because the loop gain of an integrator
+# is infinite at zero frequency.
 _NOTHING = 1e-6
 
 
@@ -144,7 +144,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
 
 def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
-    """Draw a mode shape as bars: filled bars for real parts, outlined bars for magnitudes."""
+    """Draw a mode shape: a filled bar for each real part, and an outlined bar for the modulus."""
     x, height = np.arange(len(shape)), -0.45  # the axis points down
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)
@@ -269,7 +269,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
         lines, said = sizes.get_lines()[: len(loops)], "margins at each input: phase, gain factors"
         letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
         figure.legend(lines, names, title=said, loc="outside right upper", fontsize=letters)
-        # Discrete-time poles z lie close together near 1, so their rates ln(z)/dt are drawn.
+        # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
         rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
         _pole_map(poles, {"": rates}, 0.0)
         poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
@@ -286,7 +286,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
 
 
 def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
-    """Return frequencies (k,) [rad/s], the loop gain (k, nu) at each input, and its margins."""
+    """Return frequencies (k,) [rad/s], the loop gains (k, nu) of the inputs, and their margins."""
     # The loop gain of input i is T_ii / (1 - T_ii), with T = K (s I - A + B K)^-1 B. Here s is j w,
     # or e^(j w dt) for a sampled model.
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
@@ -304,7 +304,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the gains of loop i at the frequencies where `value` changes its sign."""
+        """Return the gains of loop i at the frequencies where `value` of the gain changes sign."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))
@@ -313,8 +313,8 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         return [complex(response(w)[i]) for w in found]
 
     loops = []
-    # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real, so
-    # its phase may be -180 deg.
+    # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real. Its
+    # phase may be -180 deg there, without a change of sign of the imaginary part.
     ends = [response(0.0)] + [values[-1]] * bool(dt)
     for i in range(len(K)):
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)

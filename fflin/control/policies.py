@@ -27,7 +27,8 @@ Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 # Function of time that returns measurement noise (ny,).
 Noise: TypeAlias = Callable[[float], ArrayLike]
 
-# Function of t, q and v that returns the inputs u* of a reference, and the error e relative to it.
+# Function of t, q and v that returns the reference inputs u*, and the error e relative to the
+# reference.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
 
 
@@ -38,23 +39,23 @@ class Gridded(Protocol):
     lin: LinearModel
 
     def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the values of each joint on the grid, and the gains (N, nu, nx) in grid order."""
+        """Return the grid values of each joint, and the gains (N, nu, nx) at the grid points."""
         ...
 
 
 class Feedback:
-    """Feedback of states or outputs, about an operating point or along a motion."""
+    """Feedback of the state or of the outputs, about an operating point or along a trajectory."""
 
     lin: LinearModel
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's states in the model's axes; raise `InputError` if they do not fit."""
+        """Return the robot's state map in the model's axes; raise `InputError` on a mismatch."""
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
 
     def deviation(self, robot: Robot) -> Deviation:
-        """Return a function of t, q, v that returns the reference inputs u* and the error e."""
+        """Return the function of t, q, v that returns the reference inputs u* and the error e."""
         lin, state = self.lin, self.state_map(robot)
         S = selection(lin.state_names, state.names)
         near = S.T @ lin.x0
@@ -186,7 +187,7 @@ class AllocatedPolicy:
         return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the inputs (nu,) whose force is nearest to the force of the inner command."""
+        """Return the inputs (nu,) whose generalised force is nearest to the commanded force."""
         state = self._design.state
         chart = state.chart(q)
         u = self._design.in_base_axes(chart, self._command(t, q, v))
@@ -199,9 +200,9 @@ class AllocatedPolicy:
 
 
 def next_sample(t: float, last: float, dt: float) -> float:
-    """Return t, or raise `InputError` unless t is one sample time `dt` [s] after the last sample.
+    """Return the time t of a sample; raise `InputError` if t is not `dt` [s] after time `last`.
 
-    `last` is negative before the first sample.
+    `last` is the time of the last sample, and negative before the first sample.
     """
     apart = t - last
     if last >= 0.0 and abs(apart - dt) > 1e-6 * dt:
@@ -213,10 +214,10 @@ def next_sample(t: float, last: float, dt: float) -> float:
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return an index for each output, and the list of gyroscopes.
+    """Return the index of each measured value, and the list of gyroscopes.
 
-    The index of an output is the index of a state. The rates of the gyroscopes are numbered after
-    the states. Other sensors raise `InputError`.
+    A measured value is a state, with the index of the state, or a rate of a gyroscope. The indices
+    of gyroscope rates follow the indices of the states. Other sensors raise `InputError`.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
@@ -237,16 +238,16 @@ Measure: TypeAlias = Callable[[Array], Array]
 # Function of a controller's state z that returns the command, and the next z or dz/dt.
 Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
 
-# Function of time that returns a compensator's step, the robot's outputs, and the state near which
-# angles are unwrapped.
+# Function of time that returns a compensator's step, a function that measures the robot's outputs,
+# and the state near which angles are unwrapped.
 At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
 
 
 class Sample(NamedTuple):
-    """Law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
+    """Control law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
 
     ``A (z + jump) + B (y - y0)`` is the next z of a sampled controller, or dz/dt of a continuous
-    controller. `jump` is the change of z if the reference changes.
+    controller. `jump` is the change of z at a sample at which the reference changes.
     """
 
     A: Array
@@ -269,8 +270,8 @@ class Sample(NamedTuple):
 class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
-    The compensator's state z advances at each sample, or at each stage if dt is 0. `sizes` are the
-    sizes of z and y.
+    The compensator's state z advances at each sample, or at each stage of the integrator if dt is
+    0. `sizes` are the sizes of z and y.
     """
 
     def __init__(
@@ -314,7 +315,7 @@ class Loop:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Set z at the next stage to the weighted sum of the step's first z and its rates."""
+        """Set z at the next stage to a weighted sum of z at the start of the step and the rates."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
@@ -327,7 +328,7 @@ def decider(policy: object) -> object:
 
 
 def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
-    """Return the frame and the reference of a policy's states; each is None if unknown."""
+    """Return the frame and the reference of a policy's states, or None for each unknown one."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
@@ -347,14 +348,14 @@ def bound(policy: object, robot: Robot) -> Policy:
 
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
-    """Return the model and the gain K of a policy; each is None if the policy has none."""
+    """Return the model and the gain K of a policy, or None for each that the policy lacks."""
     by = decider(policy)
     lin = getattr(by, "lin", None)
     return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
 
 
 def fed_back(policy: object) -> tuple[str, ...]:
-    """Return the names of the states that a policy feeds back, or () if unknown."""
+    """Return the names of the states that a policy feeds back, or () if they are unknown."""
     (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time

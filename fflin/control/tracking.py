@@ -23,7 +23,8 @@ from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# A time up to this factor times the end counts as the end, because sums of time steps are rounded.
+# A time that exceeds the end time by at most this factor counts as the end, because sums of time
+# steps are rounded.
 AT_THE_END = 1.0 + 1e-9
 
 
@@ -139,7 +140,8 @@ class TrajectoryFeedback(Feedback):
             If a state does not exist.
         """
         robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
-        # The chart is centred at the start, because the attitude there may be any rotation.
+        # The reference of the chart is the initial base pose, because the initial attitude may be
+        # any rotation and a chart covers less than 180 deg.
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
         values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
         given = np.zeros(chart.nx + 3)
@@ -200,9 +202,10 @@ class TrajectoryFeedback(Feedback):
 
 
 def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
-    """Return the policy to simulate; commands are held for `held` [s], or continuous if it is 0.
+    """Return the policy to simulate.
 
-    A gain schedule is replaced by the feedback along its trajectory.
+    Its commands are held for `held` [s], or are continuous if `held` is 0. A gain schedule is
+    replaced by the feedback along its trajectory.
     """
     if isinstance(policy, Allocation):
         return replace(policy, policy=followed(policy.policy, policy.design, held))
@@ -216,14 +219,17 @@ def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
 
 
 def tracking_of(policy: object) -> TrajectoryFeedback | None:
-    """Return a policy, or the inner policy of an allocation, if it is a trajectory feedback."""
+    """Return the trajectory feedback in a policy or allocation, or None if there is none."""
     decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
 
 @lru_cache(maxsize=2)  # saves half the time of a short run
 def largest_rate(schedule: GainSchedule) -> float:
-    """Return the 95th percentile over time of the largest pole magnitude [1/s]; 0 if sampled."""
+    """Return the 95th percentile over time of the largest pole magnitude [1/s].
+
+    Return 0 for a sampled schedule.
+    """
     # The percentile excludes the short time at the end during which a large final weight makes K
     # large. During this time, the integration step may be too long.
     if schedule.dt:

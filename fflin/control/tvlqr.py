@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule(ModelDesign):
-    """Gain as a function of time, given at the knots or samples of a trajectory."""
+    """Gain as a function of time along a trajectory, given at knots or at samples."""
 
     t: Vector
     P: Array
@@ -45,14 +45,14 @@ class Schedule(ModelDesign):
 
     @cached_property
     def starts(self) -> list[float]:
-        """Start times of the intervals between knots, or start times of the samples."""
-        # A sample starts slightly before its nominal time, because times are rounded.
+        """Start times of the intervals between knots, or of the samples of a sampled schedule."""
+        # A sample starts slightly before its nominal time, so that a rounded time finds its sample.
         late = np.append(self.t[0], self.t[1:] - 1e-9 * self.dt)
         starts: list[float] = (late if self.dt else self.t[:-1]).tolist()
         return starts
 
     def interval(self, t: float) -> int:
-        """Return the index of the interval or sample at time t, or raise `InputError`."""
+        """Return the index of the interval or sample at t; raise `InputError` if t is outside."""
         t, first, last = number("t", t), self.starts[0], float(self.t[-1])
         if not first <= t <= last:
             raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
@@ -116,7 +116,7 @@ class GainSchedule(Schedule):
     frame: str
 
     def _report(self) -> str:
-        """Return the report with the sizes, the residual and the rule of the weights."""
+        """Return the report, which contains the sizes, the residual and the rule of the weights."""
         return folded([repr(self), f"weights: {self.weights or 'as given'}"])
 
     def trajectory(self, robot: Robot) -> Trajectory:
@@ -152,7 +152,7 @@ class GainSchedule(Schedule):
 
     @cached_property
     def _cubics(self) -> CubicHermiteSpline:
-        """P (nx, nx) as a function of time: cubics that match P and dP/dt at the knots."""
+        """P (nx, nx) as a function of time, by cubics that match P and dP/dt at the knots."""
         from scipy.interpolate import CubicHermiteSpline
 
         drift, spent = self.P @ self.A, self.K.mT @ self.R @ self.K
@@ -365,7 +365,7 @@ def tvlqr(
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
-    """Return whether a value is "steady"; raise `InputError` if it is another string."""
+    """Return whether `value` is "steady"; raise `InputError` if `value` is another string."""
     if isinstance(value, str) and value != "steady":
         raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")
     return isinstance(value, str)
@@ -374,7 +374,7 @@ def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool
 def held_stages(
     traj: LinearTrajectory, dt: float, Q: Array, R: Array
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield the cost matrix and the transition matrix of each sample, from first to last."""
+    """Yield the cost matrix and the transition matrix of each sample, first sample first."""
     nx, W = len(Q), block_diag(Q, R)
     for steps, whole in transitions(traj, dt):
         total, transition = np.zeros_like(W), np.eye(len(W))
@@ -385,7 +385,7 @@ def held_stages(
 
 
 def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
-    """Return the sampling time [s] of a design along a continuous trajectory; 0 by default."""
+    """Return the checked sampling time `sample` [s] of a design; 0 if it is None."""
     expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
@@ -393,7 +393,7 @@ def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
-    """Return the model at knot `end`, or the model at rest there if the knot is not steady."""
+    """Return the model at knot `end`. If the knot is not steady, return the model at rest there."""
     lin = traj[end]
     if lin.is_equilibrium():
         return lin
@@ -407,7 +407,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest at knot `end`, in base axes; rotors keep spinning."""
+    """Return the model about rest at knot `end`, in base axes. The rotors keep their speeds."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = robot.rotors
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
@@ -419,7 +419,7 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
 def steady_regulator(
     lin: LinearModel, Q: Array, R: Array, sample: float | None
 ) -> tuple[Array, Array]:
-    """Return the cost P (nx, nx) and the gain K (nu, nx) of a regulator about a steady point."""
+    """Return the cost matrix P (nx, nx) and the gain K (nu, nx) about a steady point."""
 
     def regulator(lin: LinearModel, Q: Array) -> Gain:
         if not sample:

@@ -1,4 +1,4 @@
-"""Weights of a quadratic cost, which are given by the user or computed by a rule."""
+"""Weights of a quadratic cost, given by the user or computed by a rule."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,15 @@ Weight: TypeAlias = ArrayLike | Mapping[str, float]
 # Rule for the weights: its name, or a mapping with the keys of `weights` in `Robot.replace`.
 Rule: TypeAlias = str | Mapping[str, object]
 
-# A weight from the user, its name or pattern, and whether it was given as a largest value (Bryson).
+# A weight from the user, its name or pattern, and whether the user gave a largest value instead of
+# the weight (Bryson's rule).
 _Given: TypeAlias = tuple[float, str, bool]
 
-# An asymmetry or a negative eigenvalue of a weight is rounding error if its magnitude, relative to
-# the largest entry, is below this.
+# An asymmetry or a negative eigenvalue of a weight matrix counts as rounding error if its magnitude
+# is at most this times the largest entry.
 _ROUNDING = 1e-9
 
-# Bandwidth with which wheel speeds are regulated, as a fraction of the bandwidth of the loop.
+# Bandwidth of the wheel speeds, relative to the bandwidth of the loop.
 _SPEEDS = 0.1
 
 
@@ -102,7 +103,7 @@ def inverse_square(what: str, size: float) -> float:
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
-    """Return a weight (k, k) from a matrix, a diagonal, a number, or numbers by name or pattern."""
+    """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
     size, rounding = len(names), 0.0
     if isinstance(value, Mapping):
         matrix = np.diag(_diagonal(what, value, names, complete=definite))
@@ -128,10 +129,11 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
 def require_semidefinite(
     what: str, matrix: Array, names: Sequence[str], rounding: float, definite: bool = False
 ) -> None:
-    """Raise `InputError` with the lowest eigenvalue if a matrix is not positive semidefinite.
+    """Raise `InputError` if a matrix is not positive semidefinite.
 
-    A negative eigenvalue is permitted if its magnitude is at most `rounding` times the largest
-    entry. If `definite` is True, the matrix must be positive definite.
+    The message gives the lowest eigenvalue. A negative eigenvalue is permitted if its magnitude is
+    at most `rounding` times the largest entry. If `definite` is True, the matrix must be positive
+    definite.
     """
     try:
         np.linalg.cholesky(matrix)  # quicker than eigenvalues
@@ -149,7 +151,7 @@ def require_semidefinite(
 def cost_weights(
     of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
-    """Return the checked weights as matrices; N is zero by default."""
+    """Check the weights Q, R and N, and return them as matrices; N is zero by default."""
     Q = weight("Q", Q, of.state_names)
     R = weight("R", R, input_keys(of), definite=True)
     cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
@@ -249,10 +251,13 @@ def _diagonal(
 def rule_weights(
     lin: LinearModel, given: Rule | None, pace: Pace, wheel_speeds: bool | None = None
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N by a rule with given weights, and a description of the rule."""
+    """Return Q, R and N by a rule, and a description of the rule.
+
+    Weights in `given` replace the weights of the rule.
+    """
     # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
     # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
-    # the rule; if they do not, it is "urdf".
+    # the rule. If the robot names no rule, the rule is "urdf".
     source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
     own = lin.weights if given.get("rule") is None else {}
@@ -266,8 +271,9 @@ def rule_weights(
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
     if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
-        # A common factor of Q and R does not change the gain. The rule's weights are scaled so that
-        # the largest values of the named states and inputs cost 1, as in Bryson's rule.
+        # A common factor of Q and R does not change the gain. In Bryson's rule, a signal costs 1 at
+        # its largest value. The rule's weights are scaled so that the signals with a given largest
+        # value also cost 1 at the rule's largest values, in the geometric mean.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
         scale = math.exp(-np.log(costs).mean()) if costs else 1.0
         Q, R = scale * Q, scale * R
@@ -287,8 +293,8 @@ def _of_regulated(
 ) -> tuple[Array, Array, str, Array]:
     """Return Q (nx, nx), R, the rule and the costs (nx + nu,), for a model that may have wheels.
 
-    The cost of a state or input is its contribution at its largest value. It is 0 if the rule has
-    no largest value for it.
+    The costs are the contributions of the states and inputs to the cost function at their largest
+    values. The cost is 0 for states and inputs without a largest value in the rule.
     """
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
@@ -296,7 +302,8 @@ def _of_regulated(
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
-    # A wheel that is already at its limit is treated as a wheel at rest, and the report names it.
+    # A wheel that is already at its speed limit gets the room of a wheel at rest, and the report
+    # names the wheel.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
     momenta = dict(zip(names, room, strict=True))
     Q, R, rule, bandwidth, terms = default_weights(body, pace, momenta)
@@ -311,7 +318,7 @@ def _of_regulated(
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
         # The inputs that exert no force on the robot without its wheels form a null space. Inputs
-        # with coordinates n in this null space change the wheel speeds at the rates X n.
+        # with coordinates n in this null space accelerate the wheels by X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
@@ -322,7 +329,7 @@ def _of_regulated(
 def _weights_of(
     lin: LinearModel, given: Mapping[str, object], *, of_robot: bool = False
 ) -> dict[int, _Given]:
-    """Return the given weights by index; the indices of inputs follow the indices of states."""
+    """Return {index: given weight}. The indices of the inputs follow the indices of the states."""
     states, inputs = lin.state_names, input_keys(lin)
     found, every = dict[int, _Given](), (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)

@@ -1,4 +1,4 @@
-"""Accelerations and derivatives by the articulated-body algorithm, to check linear models."""
+"""Accelerations and their derivatives by the articulated-body algorithm, to check models."""
 
 import numpy as np
 import pinocchio as pin
@@ -10,7 +10,7 @@ from fflin.dynamics.state import Actuation, StateMap
 
 
 class Aba:
-    """Nonlinear dynamics of a robot with all its forces, in base axes."""
+    """Nonlinear dynamics of a robot with all its forces; base velocities are in base axes."""
 
     def __init__(self, state: StateMap) -> None:
         robot = state.robot
@@ -27,7 +27,11 @@ class Aba:
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order; u is in base axes, tau an additional force."""
+        """Return dv/dt (nv,) in Pinocchio's order.
+
+        A torque and force on the base in `u` are in base axes. `tau` (nv,) is an additional
+        generalised force in Pinocchio's order.
+        """
         forces = self.actuation.fixed @ u
         if self._resists:
             forces += self._passive_force(q, v)
@@ -39,7 +43,7 @@ class Aba:
         return self.field.relative(v, absolute, rate) if self.field else rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (N, nv) at N points; see `acceleration`."""
+        """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
         state = self.state
         if self.field or state.robot.followers or state.robot.stored_momentum:
             return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
@@ -53,7 +57,7 @@ class Aba:
         return found
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
-        """Return, for each acceleration (6 + n,), the sum of the magnitudes of its terms."""
+        """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms."""
         state, data = self.state, self._data
         M = state.project(pin.crba(self._model, data, q).T)
         columns = self.actuation.columns(data, q)
@@ -62,13 +66,14 @@ class Aba:
         return np.abs(np.linalg.inv(M)) @ forces
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return the derivatives of dnu/dt over the tangent of q, over nu and over u.
+        """Return the derivatives of dnu/dt with respect to the tangent of q, to nu and to u.
 
-        The derivatives (6 + n, ..) are in state order, and `u` is in base axes.
+        The derivatives (6 + n, ..) are in state order. A torque and force on the base in `u` are in
+        base axes.
         """
-        # Wrenches of thrusters are constant in the frames of their links, so the derivative over q
-        # includes d(B u)/dq. The derivatives over u are the accelerations that unit inputs cause at
-        # rest.
+        # Wrenches of thrusters are constant in the frames of their links, so the derivative with
+        # respect to q includes d(B u)/dq. The derivatives with respect to u are the accelerations
+        # that unit inputs cause at rest without gravity.
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau, field = state.lift(self.actuation.fixed @ u + self._passive_force(q, v)), self.field
@@ -89,7 +94,8 @@ class Aba:
         for joint, momentum in state.robot.stored_momentum:
             pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, at_rest)
             local = self._model, self._data, joint, pin.ReferenceFrame.LOCAL
-            # Derivatives of the link's angular velocity, in the link's axes, over q and v.
+            # Derivatives of the link's angular velocity with respect to q and v, in the link's
+            # axes.
             turning, jacobian = (x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local))
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
@@ -108,7 +114,7 @@ class Aba:
         return by_q, by_v, np.column_stack(by_u)
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
-        """Return the wrench on each link: inputs, gyroscopic torques and gravity gradient."""
+        """Return the wrench on each link from inputs, gyroscopic torques and gravity gradient."""
         stored, wrenches = self.state.robot.stored_momentum, self.actuation.wrenches(u)
         wrenches = wrenches or self._none
         if not (stored or self.field):
@@ -143,12 +149,12 @@ class Aba:
     def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the acceleration derivatives over q, v and force of a robot with mimic joints."""
-        # The accelerations satisfy S^T M S nudot = S^T (tau - b). The constraint forces of mimic
-        # joints drop out of this equation. ABA needs a regular M, but M is singular if a mimic
-        # joint or its leader moves no mass. So each mimic joint and its leader get a rotor. The
-        # rotor's inertia is the diagonal entry of S^T M S for their coordinate. The rotors'
-        # contribution to S^T M S is subtracted afterwards.
+        """Return the derivatives of dnu/dt with respect to q, v and force, for mimic joints."""
+        # The accelerations satisfy S^T M S nudot = S^T (tau - b), without the constraint forces of
+        # mimic joints. ABA needs a regular M, but M is singular if a mimic joint or its leader
+        # moves no mass. So each mimic joint and each leader gets a rotor. The inertia of the rotor
+        # is the diagonal entry of S^T M S for the coordinate of the leader. The contribution of the
+        # rotors to S^T M S is subtracted afterwards.
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

@@ -113,7 +113,10 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
 
 
 def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]) -> T:
-    """Return the converted tuple of `laid_out`; append its words and its laned arrays to lists."""
+    """Return the converted tuple of `laid_out`; append to its lists `words` and `fresh`.
+
+    `words` receives the words of the tuple, `fresh` one pair for each array with lanes.
+    """
     parts: list[object] = []
     for part, of in zip(value, kind.kinds.values(), strict=True):
         if isinstance(of, Struct):

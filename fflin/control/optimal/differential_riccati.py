@@ -1,4 +1,4 @@
-"""Solver of differential Riccati equations, backwards in time; P stays positive semidefinite."""
+"""Differential Riccati equations, integrated backwards in time; P stays positive semidefinite."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT
 
-# Between two knots, P is a cubic. Knots are added until the cubic has this relative accuracy.
+# P is a cubic between knots. Knots are added until the cubic has this relative accuracy.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 
@@ -30,7 +30,10 @@ def rate(coefficients: Array, P: Array) -> Array:
 
 
 def joined(early: Array, late: Array) -> Array:
-    """Return the transitions over `early` intervals and then over `late` intervals."""
+    """Return the transitions over pairs of successive intervals.
+
+    `early` and `late` are the transitions over the first and the second interval of each pair.
+    """
     (T, G, W), (T_late, G_late, W_late) = early, late
     n = T.shape[-1]
     right = np.concatenate((T, G @ T_late.mT), axis=-1)
@@ -41,7 +44,7 @@ def joined(early: Array, late: Array) -> Array:
 
 
 def stepped_back(transition: Array, P: Array) -> Array:
-    """Return P at the start of the interval, W + T' P (I + G P)^-1 T, from P at its end."""
+    """Return P at the start of an interval, W + T' P (I + G P)^-1 T, from P at its end."""
     T, G, W = transition
     forward = np.linalg.solve(np.eye(len(P)) + G @ P, T)
     costate = P @ forward
@@ -52,10 +55,12 @@ def stepped_back(transition: Array, P: Array) -> Array:
 def transitions(early: Array, late: Array, h: Array) -> Array:
     r"""Return fourth-order transitions over k intervals, from coefficients at the Gauss nodes.
 
-    The coefficients (3, k, nx, nx) are A, S and Q. The transitions (3, k, nx, nx) are the matrices
-    T, G and W of the solution ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1`` of the Hamiltonian
-    system, with the states x0, x1 and the costates l0, l1 at the start and at the end of an
-    interval. G and W are positive semidefinite.
+    The coefficients (3, k, nx, nx) are A, S and Q at the `early` and at the `late` node. `h` (k,)
+    contains the lengths of the intervals. The transitions (3, k, nx, nx) are T, G and W.
+
+    Let an interval start with the state x0 and the costate l0, and end with x1 and l1. Then the
+    Hamiltonian system has the solution ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1``. In a short
+    interval, G and W are positive semidefinite.
     """
     mixed = np.concatenate((HEAVY * early + LIGHT * late, LIGHT * early + HEAVY * late), axis=1)
     both = _constant(mixed, 0.5 * np.concatenate((h, h)))
@@ -63,13 +68,17 @@ def transitions(early: Array, late: Array, h: Array) -> Array:
 
 
 def _constant(coefficients: Array, h: Array) -> Array:
-    """Return transitions for constant coefficients, by a matrix exponential and doubling."""
+    """Return the transitions over times h (k,) for constant coefficients.
+
+    The matrix exponential gives the transitions over short times, which are then doubled.
+    """
     A, S, Q = coefficients
     n, (a, s, q) = A.shape[-1], np.abs(coefficients).max(axis=1)
     sizes = np.block([[a, s], [q, a.T]])
     if not sizes.max() < 1e300:
         raise np.linalg.LinAlgError("the coefficients are too large")
-    # Scale the states so that rows and columns have similar sizes; costates get inverse scales.
+    # Scale the states so that rows and columns of the Hamiltonian matrix have similar sizes. The
+    # costates get the inverse scales.
     _, (scale, _) = matrix_balance(sizes, permute=False, separate=True)
     unit = np.sqrt(scale[:n] / scale[n:])
     of_costs, of_states = np.outer(unit, unit), unit / unit[:, None]
@@ -93,7 +102,7 @@ _Interval = tuple[float, float, Array, Array]
 
 
 def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
-    """Return the k intervals between knots (k + 1,), with their transitions."""
+    """Return the k intervals between knots (k + 1,), with transitions and coefficients."""
     a, b, count = knots[:-1], knots[1:], len(knots) - 1
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
@@ -106,7 +115,7 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
 
 
 def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Integrate P backwards from the last knot, and return the times and the values of P.
+    """Integrate backwards from P at the last knot, and return the times and the values of P.
 
     `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast, raise
     `LinAlgError`.
@@ -118,12 +127,12 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
         while pending:
             start, end, (whole, early, late), (at_start, at_end) = pending.pop()
             P, middle, error = values[-1], 0.5 * (start + end), math.inf
-            # A long step may fail because its coefficients are indefinite. Shorter steps are then
-            # tried.
+            # The coefficients of a long step may be indefinite, because beta in (10.3) is negative.
+            # The step may then fail, and shorter steps are tried.
             with suppress(np.linalg.LinAlgError):
                 single, half = stepped_back(whole, P), stepped_back(late, P)
                 double = stepped_back(early, half)
-                # `between` is the value of the Hermite cubic at the middle of the interval.
+                # `between` is the Hermite cubic of P at the middle of the interval.
                 bend = rate(at_start, double) - rate(at_end, P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
                 # The method has fourth order, so the error of two half steps is a fifteenth of
@@ -140,9 +149,10 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
 
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
-    """Return K and P from the last sample to the first, and the largest relative residual."""
-    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost of the error and the
-    # input at the start of a sample. The second (nx, nx + nu) maps them to the next error.
+    """Return K and P of all samples, the last sample first, and the largest relative residual."""
+    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost matrix of a sample, for
+    # the error at its start and the input. The second (nx, nx + nu) maps this error and the input
+    # to the next error.
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole
@@ -160,7 +170,7 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
 
 @contextmanager
 def bounded_by(remedy: str) -> Iterator[None]:
-    """Raise `InputError`, which recommends `remedy`, if P changes too fast."""
+    """Replace a `LinAlgError` of the integration by an `InputError` that recommends `remedy`."""
     try:
         # NumPy's warnings are not needed, because an overflow of P raises an error.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -172,7 +182,7 @@ def bounded_by(remedy: str) -> Iterator[None]:
 
 
 def imbalance(terms: Array) -> float:
-    """Return the largest norm of a sum of matrices, relative to the norms of the terms.
+    """Return the largest norm of a sum of matrices, relative to the sum of the norms of its terms.
 
     `terms` (k, .., n, n) contains the k terms of each sum.
     """

@@ -10,46 +10,50 @@ from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 
-# A plan is accepted if the sum of its violations [rad, m, s] of goal and limits is at most this.
+# A plan is accepted if the sum of its violations of the goal and the limits [rad, m, s] is at most
+# this.
 _ENDS = 1e-8
 
-# A point within an interval gets a limit once an iterate exceeds the limit at this point, or at a
-# neighbour, by the fraction _LIMITED. The limit is tightened by the fraction _TIGHTER, because the
-# motion may exceed it between the points.
+# Within an interval, a limit applies to a state at a point only after an iterate has exceeded it
+# there, or at a neighbouring point, by _LIMITED times the limit. The limit is then tightened by the
+# fraction _TIGHTER, because the motion may exceed it between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
-# If no gap exceeds this, the gaps count as closed, and the plan is integrated as one motion.
+# If no gap between intervals exceeds this, the gaps count as closed, and the plan is integrated as
+# one motion.
 _MEETS = 1e-10
 
-# After a plan is integrated as one motion, its violations are corrected only if their sum is at
-# most half of this.
+# When a plan is first integrated as one motion, its violations are corrected only if their sum is
+# at most half of this.
 _NEARLY = 1e-3
 
-# Integration accuracy of interval ends: _SEEKS during the search, and _FLIES while the gaps are
-# closed.
+# Accuracy [rad, m, s] of the integration over an interval: _SEEKS during the search, and _FLIES
+# while the gaps are closed.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# The search ends after _MOST iterations, or if the predicted reduction of the merit function is
-# less than the fraction _SAVED.
+# The search ends after _MOST iterations. It ends earlier if an iteration adds no limit within the
+# intervals, and if the predicted reduction of the merit function is at most _SAVED times its value.
+# The gaps are closed in at most _MOST_CLOSING iterations. At most _MOST_HALVINGS lengths of a step
+# are tried.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
-# Cost of a change of wheel angles and rates in an iteration, relative to the cost for other states.
-# It is small, because wheels may have any angle and rate.
+# Additional cost of a step of the wheel angles and rates, relative to the additional cost of a step
+# of the other states. It is small, because wheels may turn far and fast.
 _OF_WHEELS = 1e-6
 
-# The search also ends if the solutions of the quadratic programs violate the goal or the limits at
-# the knots by more than _HOPELESS [rad or m], and if this violation does not fall by a tenth in
-# _STAGNANT iterations. Smaller violations are due to the finite penalty. They vanish when the gaps
-# are closed.
+# The search fails if, over _STAGNANT iterations, the solutions of the quadratic programs violate
+# the goal or the limits at the knots by more than _HOPELESS [rad or m], and this violation does not
+# fall by a tenth. Smaller violations are due to the finite penalty. They vanish when the gaps are
+# closed.
 _STAGNANT, _HOPELESS = 10, 1e-2
 
-# Penalty for a violation of the goal or a limit by 1 rad or 1 m. The unit of the penalty is the
-# cost of the initial guess.
+# Penalty for a violation of the goal or a limit by 1 rad or 1 m. The cost of the initial guess
+# is 1.
 _PRICE = 1e3
 
 
 class Trial(NamedTuple):
-    """Knots and inputs of a trial, its gaps, and the distances of its states from limits."""
+    """Knots and inputs of a trial, with gaps between intervals and distances from the limits."""
 
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
@@ -71,8 +75,8 @@ class Trial(NamedTuple):
 class Search(NamedTuple):
     """Search for the inputs of least effort from a start state to an end state."""
 
-    # The Hessian is the Gauss-Newton approximation. Steps of the states have an additional cost,
-    # which is reduced if a full step succeeds (Levenberg-Marquardt).
+    # The Hessian is the Gauss-Newton approximation. The additional cost of a step of the states is
+    # reduced after a full step and raised after a short step (Levenberg-Marquardt).
 
     shooting: Shooting
     start: Point
@@ -86,9 +90,10 @@ class Search(NamedTuple):
     report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> Trial:
-        """Return the trial of least effort, or the motion of the last inputs if the search fails.
+        """Return the trial of least effort.
 
-        The search begins at the knots q, v and the inputs u.
+        The search begins at the knots q, v and the inputs u. If the search fails, return the motion
+        under the last inputs.
         """
         shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
@@ -153,12 +158,12 @@ class Search(NamedTuple):
     def _step(
         self, trial: Trial, limited: Mask, near: Array, effort: Array, left: list[float]
     ) -> tuple[Array, Array, Array, float] | None:
-        """Return the optimal step of the knots and inputs, or None if none helps.
+        """Return the optimal steps of the knots and of the inputs, or None if no step helps.
 
-        The further results are the multipliers and the sum of all remaining violations. `left`
-        contains the violations at the knots that remained after earlier quadratic programs. The
-        violations of this one are appended; if they are large and did not fall by a tenth in
-        _STAGNANT iterations, the step does not help.
+        The other two results are the multipliers of the gaps, and the sum of the limit violations
+        after the step. `left` contains the violation at the knots after each earlier quadratic
+        program, and the violation after this program is appended. If the violation is large and
+        has not fallen by a tenth in `_STAGNANT` iterations, no step helps.
         """
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
@@ -167,8 +172,8 @@ class Search(NamedTuple):
             ends, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
         except InputError:  # the motion has diverged
             return None
-        # The soft limits of states at knots, and of states within intervals, which depend on
-        # (x[k], u[k], u[k + 1]).
+        # Soft limits apply to states at knots and to states within intervals. The latter depend on
+        # x[k], u[k] and u[k + 1].
         nw, (knot, limit) = nx + u.shape[1], np.nonzero(np.isfinite(trial.knots).any(axis=0))
         at_knots = sp.eye_array(len(u) * nw, format="csr")[knot * nw + limit]
         k, part, state = np.nonzero(limited)
@@ -193,7 +198,10 @@ class Search(NamedTuple):
         return *found, float(outside)
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
-        """Close the gaps between intervals with the smallest changes, if possible."""
+        """Close the gaps between intervals by the smallest steps of the knots and the inputs.
+
+        If a gap remains, return the motion under the last inputs.
+        """
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
@@ -206,9 +214,9 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # `one` is integrated in one piece. If its violation is more than half of the
-                # previous one, errors grow too fast along the motion. Then the trial with separate
-                # intervals is returned.
+                # `one` is integrated as one motion. If its violation is more than half of the
+                # previous violation, errors grow too fast along the motion to be corrected. Then
+                # the trial with separate intervals is returned.
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
@@ -220,20 +228,20 @@ class Search(NamedTuple):
         return trial if trial.gap <= _MEETS else self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
-        """Integrate the motion from the start under the inputs, and return it as a trial."""
+        """Integrate the motion from the start under the inputs u, and return it as a trial."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
 
 
 def excess(room: Array) -> Array:
-    """Return by how much points exceed limits.
+    """Return the excess (..) of values over their limits, which is 0 within the limits.
 
-    `room` (2, ..) contains the lower and upper limits minus the values at the points.
+    `room` (2, ..) contains the lower and the upper limits, both minus the values.
     """
     return np.maximum(np.maximum(room[0], -room[1]), 0.0)
 
 
-# Absolute and relative tolerance of the optimality conditions of the scaled problem.
+# Absolute and relative tolerance of the optimality conditions of the scaled quadratic program.
 _ACCURACY = 1e-10
 
 
@@ -257,13 +265,13 @@ def solve_stages(
         \mathrm{low}_k \le u_k \le \mathrm{high}_k, \quad
         \mathrm{room}_0 - s \le \mathrm{rows}\,w \le \mathrm{room}_1 + s, \quad s \ge 0
 
-    `ends` (N, nx, nx + 2 nu) contains A, B and D side by side; D is zero if inputs are held. cost
-    and g have one row for each knot; no entry of cost is negative. `limits` (2, N + 1, nu) contains
-    low and high. `rows` has a column for each entry of w. `scale` (nx + nu,) contains typical sizes
-    of the variables, by which the program is scaled.
+    `ends` (N, nx, nx + 2 nu) contains A, B and D side by side; D is zero if inputs are held. `cost`
+    and `g` (N + 1, nx + nu) have one row for each knot, and no entry of `cost` is negative.
+    `limits` (2, N + 1, nu) contains low and high. `rows` has a column for each entry of w. The
+    program is scaled by `scale` (nx + nu,), the typical sizes of the entries of x and u.
 
-    Returns x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
-    Returns None if the program is infeasible or the solver fails.
+    Return x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
+    Return None if the program is infeasible or the solver fails.
     """
     piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
     (N, nx, _), (knots, nw), m = ends.shape, g.shape, len(prices)
@@ -274,13 +282,14 @@ def solve_stages(
     links = links + sp.hstack((none, sp.block_diag(after)))
     first = sp.eye_array(nx, knots * nw)
     E = sp.diags_array(of_rows) @ sp.vstack((first, links)) @ sp.diags_array(size)
-    # Whole blocks are stored, because PIQP would otherwise make rounding errors in inputs of 0.
+    # Full blocks of H are stored, including zeros. Without the zeros, PIQP would return inputs that
+    # differ from 0 by rounding errors.
     H = (cost * scale**2)[:, :, None] * np.eye(nw)
     unit = H.max() or 1.0
     bounds = np.full((2, knots, nw), [[[-np.inf]], [[np.inf]]])
     bounds[:, :, nx:] = limits / scale[nx:]
     low, high = bounds.reshape(2, -1)
-    # Each soft limit has a slack s, with rows w + s >= low and rows w - s <= high.
+    # Each soft limit has a slack s: ``rows w + s >= room[0]`` and ``rows w - s <= room[1]``.
     soft, slack, open_ = rows @ sp.diags_array(size), sp.eye_array(m), np.full(m, np.inf)
     G = sp.vstack((sp.hstack((soft, slack)), sp.hstack((soft, -slack))), format="csc")
     of_G = np.append(room[0], -open_), np.append(open_, room[1])

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution whose relative residual is at most this is accepted, and no other method is tried.
+# A solution with at most this relative residual is accepted, and no other method is tried.
 _SOUND = 1e-11
 _STEPS = 25
 
@@ -26,14 +26,16 @@ _NEAR = 1e-3
 _APART = 1e-5
 
 # A pole is near the stability boundary if its distance from the boundary, relative to the largest
-# pole, is below this. Rounding errors move a pole by such a distance if Q does not weight its mode.
+# pole magnitude, is below this. If Q does not weight an undamped mode, its pole stays on the
+# boundary, but rounding errors move the pole by such a distance.
 _NEAR_BOUNDARY = 1e-6
 
 
 class Solution(NamedTuple):
     """Solution P of a Riccati equation, with its gain K, residual and method.
 
-    `poles` are the sorted poles of A - B K. `margin` is their distance from the stability boundary.
+    `poles` are the sorted poles of A - B K. `margin` is the distance of the nearest pole from the
+    stability boundary.
     """
 
     P: Array
@@ -47,7 +49,7 @@ class Solution(NamedTuple):
 def solved(
     P: Array, K: Array, poles: Values, residual: float, method: str, *, discrete: bool = False
 ) -> Solution:
-    """Return a solution with sorted poles and their margin."""
+    """Return a `Solution` with sorted poles and with the margin of the poles."""
     poles = poles[np.lexsort((poles.imag, poles.real))]
     margin = float(1.0 - np.abs(poles).max() if discrete else -poles.real.max())
     return Solution(P, K, poles, residual, method, margin)
@@ -124,10 +126,10 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Return the stabilising solution of the half-size method, or of SciPy if this is inaccurate.
+    """Return the stabilising solution; use SciPy only if the half-size method is inaccurate.
 
-    Raise `LinAlgError` if both fail. Newton's method refines the solution (D. L. Kleinman, IEEE
-    Trans. Automatic Control 13(1), 1968).
+    Raise `LinAlgError` if SciPy fails too. Newton's method refines the solution (D. L. Kleinman,
+    IEEE Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -162,7 +164,7 @@ def half_size(
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve by the half-size method, with rows and columns of Q for rates scaled by 1 + `apart`."""
+    """Solve by the half-size method. Scale the rows and columns of Q for rates by 1 + `apart`."""
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -170,7 +172,7 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         A, Q, cross = source.A, source.Q, source.cross
         if cross is not None:
-            # The substitution u + R^-1 N' x for the input removes the cross term from the cost.
+            # If u + R^-1 N' x is regarded as the input, the cost has no cross term.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
         scale = np.ones(len(A))
@@ -186,20 +188,21 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
     if apart or (found is not None and found.residual <= _SOUND):
         return found
     # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
-    # method then starts from a slightly different loop.
+    # method then starts from the loop of a slightly different Q.
     return _half_size(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation with the same P as a sampled equation (10.6), or None."""
+    """Return the continuous equation (10.6) with the same P; None if its R is not definite."""
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # Rows of Bc that should be zero contain rounding errors, so they are set to zero. Newton's
-    # method corrects the effect, because it uses the original equation.
+    # The half-size method requires that the position rows of Bc are exactly zero. Rows that contain
+    # only rounding errors are therefore set to zero. Newton's method corrects the effect on P,
+    # because it uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -219,7 +222,7 @@ def _finished(
 def _refined(
     equation: Riccati, P: Array, modes: ModalMatrix | None
 ) -> tuple[_Trial, ModalMatrix | None]:
-    """Refine P by Newton steps; `modes` are None, or belong to a loop near the loop of P."""
+    """Refine P by Newton steps; `modes` belong to a loop near the closed loop of P, or are None."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
     fresh = False
@@ -231,8 +234,8 @@ def _refined(
             modes, fresh = ModalMatrix.of(F, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # Far from the solution, a Newton step may improve P although the residual rises, so it is
-        # accepted.
+        # Far from the solution, a Newton step may improve P although the residual rises. Such a
+        # step is accepted.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
@@ -252,7 +255,8 @@ def _refined(
 def _general(equation: Riccati, unit: bool) -> Array:
     """Solve with SciPy.
 
-    `unit` scales the inputs so that R is I, because SciPy treats a badly scaled R as singular.
+    If `unit` is True, scale the inputs so that R is I, because SciPy treats a badly scaled R as
+    singular.
     """
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
@@ -293,17 +297,17 @@ class ModalMatrix:
 
     def lyapunov_modal(self, r: Values) -> Array:
         """Solve the equation of `lyapunov`, with r given as V^H r V."""
-        # In modal coordinates, the factors solve the equation element by element.
+        # In modal coordinates, each entry of the solution is the entry of r times a factor.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 
     def poles(self, F: Array) -> Values:
-        """Return the eigenvalues of F; if the modes V decouple F, avoid an eigenproblem."""
+        """Return the eigenvalues of F, without an eigenproblem if the modes V decouple F."""
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
         M.flat[:: len(M) + 1] = 0.0
-        # If a diagonal matrix is multiplied by I + X, the relative change of its eigenvalues is at
-        # most the norm of X.
+        # Divide each column of the off-diagonal part M by the diagonal entry of the column. The
+        # norm of the result bounds the relative errors of the diagonal entries as eigenvalues.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
         real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
@@ -315,18 +319,19 @@ class ModalMatrix:
 def second_order_loop(
     A: Array, B: Array, Q: Array, R_factor: Array
 ) -> tuple[ModalMatrix, Values] | None:
-    """Return a loop that is optimal if odd powers of its poles are neglected (10.5).
+    """Return the loop that is optimal if the odd powers of the poles in (10.5) are neglected.
 
-    The results are the modes V of the loop, and the cost V^H (Q + K' R K) V of its gain K. Return
-    None if there is no such loop, for example because the model is not of second order.
+    The results are the modes V of the closed loop, and the cost matrix V^H (Q + K' R K) V for the
+    gain K of this loop. Return None if there is no such loop, for example because the model is not
+    of second order.
     """
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # The effect B R^-1 B' of the inputs on the velocities is Ls Ls'. The product is not computed,
-    # because this would square the condition number.
+    # Ls Ls' is the effect B R^-1 B' of the inputs on the velocities. Ls is computed without this
+    # product, because the product would square the condition number.
     triangle = np.asarray(np.linalg.qr(white, mode="r"))
     Ls = triangle.T
     sizes = np.abs(Ls.diagonal())
@@ -358,8 +363,8 @@ def second_order_loop(
     if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
     poles = -np.sqrt(squares)
-    # The lower half of each eigenvector is the acceleration a of a mode: a = `squares` times the
-    # position.
+    # The lower half of each eigenvector is the acceleration a of a mode. The position is a divided
+    # by `squares`, and the rate is a divided by `poles`.
     a = W[m:]
     motion = np.concatenate((a / squares, a / poles))
     if not plain:

@@ -15,42 +15,43 @@ from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
-# Least number of steps per interval in a trial, because limits also apply within the intervals, at
-# the ends of up to as many equal parts. All numbers of steps are powers of 2.
+# Least number of steps per interval in a trial. Limits also apply within an interval, at the ends
+# of up to this many equal parts, which must be ends of steps. All numbers of steps and parts are
+# powers of 2.
 _STEPS = 16
 
-# Jacobians are integrated with a quarter of the steps of the motion, but with at most this number.
+# Jacobians are integrated with a quarter of the steps of the motion, but with at most this number
+# of steps.
 _MOST_OF_JACOBIANS = 16
 
 Point = tuple[Array, Array]
 
-# Configurations (N, steps + 1, nq) and velocities (N, steps + 1, nv) of the motions of N intervals
-# from the knots, with a row for the start and for each step.
+# Configurations (N, steps + 1, nq) and velocities (N, steps + 1, nv) of the motions over N
+# intervals. The first row of a motion is its knot, and each step adds a row.
 Motions = tuple[Array, Array]
 
 
 class Shooting:
-    """Multiple shooting with N motions, which start at equally spaced knots.
+    """Multiple shooting over N intervals between equally spaced knots.
 
-    t (N + 1,) contains the times of the knots and of the end.
+    `t` (N + 1,) contains the times [s] of the knots. Inputs are constant over an interval if `held`
+    is True, and linear otherwise.
     """
 
-    # A step z (nx,) from one point to another has the order of the states of the linear models, in
-    # base axes. The rotation vector of the base replaces 2 q_b.
+    # A step z (nx,) from one point to another has the order of the state of a linear model, in base
+    # axes. Its first three entries are a rotation vector, which is 2 q_b to first order.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
-        # The engine of the linearisation is fixed, so that earlier computations do not change any
-        # bit of a plan.
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
-        """Return the step z (nx,) between two points, with zero change of the wheel angles."""
+        """Return the step z (nx,) from `start` to `end`, with zero change of the wheel angles."""
         state = self.state
         difference = pin.difference(state.robot.model, start[0], end[0])
         z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
@@ -58,7 +59,7 @@ class Shooting:
         return z
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
-        """Return the knots after a step z (N + 1, nx)."""
+        """Return the knots q, v after steps z (N + 1, nx), one for each knot."""
         model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
         return integrate_rows(model, q, self.state.spread(difference)), v + self.state.spread(rates)
 
@@ -80,12 +81,12 @@ class Shooting:
         return np.stack(configurations, axis=1), np.stack(speeds, axis=1)
 
     def missed(self, q: Array, v: Array, motions: Motions) -> Array:
-        """Return the gaps (N, nx) between the ends of the intervals and the next knots."""
+        """Return the gaps (N, nx): the steps from a knot to the end of the motion before it."""
         knots, ends = zip(q[1:], v[1:], strict=True), zip(*(x[:, -1] for x in motions), strict=True)
         return np.array([self.between(*pair) for pair in zip(knots, ends, strict=True)])
 
     def flown(self, start: Point, u: Array) -> Point:
-        """Integrate the motion from a point under the inputs u, and return its knots."""
+        """Integrate the motion from a point under the inputs u; return q and v at the knots."""
         q, v = (np.tile(each, (len(u), 1)) for each in start)
         for k in range(len(u) - 1):
             found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
@@ -93,7 +94,7 @@ class Shooting:
         return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
-        """Return the values (.., nx) of states with limits: joint positions and rates.
+        """Return the values (.., nx) of the states that can have limits: joint positions and rates.
 
         The values of the base are zero.
         """
@@ -104,12 +105,15 @@ class Shooting:
         return values
 
     def inside(self, motions: Motions, parts: int) -> Array:
-        """Return `limited_values` (N, parts, nx) at the ends of equal parts of each interval."""
+        """Return `limited_values` (N, parts, nx), with `parts` equal parts of each interval.
+
+        The values are taken at the end of each part.
+        """
         every = (motions[0].shape[1] - 1) // parts
         return self.limited_values(*(each[:, every::every] for each in motions))
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Find the number of steps for which interval ends have this accuracy [rad, m, s]."""
+        """Set the number of steps so that interval ends have the given accuracy [rad, m, s]."""
         self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
@@ -119,13 +123,15 @@ class Shooting:
                 break
 
     def jacobians(self, q: Array, v: Array, u: Array, parts: int = 1) -> tuple[Array, Array]:
-        """Return Jacobians of interval ends, and of points within the intervals.
+        """Return the Jacobians of the interval ends, and of points within the intervals.
 
-        The first array (N, nx, nx + 2 nu) contains the Jacobians of the ends. Its columns belong to
-        z at the start, and to the inputs at both knots. The second array (N, parts - 1, nx,
-        nx + 2 nu) contains the Jacobians at the points that divide each interval into equal parts.
+        The first array (N, nx, nx + 2 nu) contains the Jacobians of the interval ends with respect
+        to three vectors: the step z of the first knot, the inputs at the first knot, and the inputs
+        at the next knot. The second array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of
+        the points that divide each interval into equal parts.
         """
-        # Runge-Kutta steps of dZ/dt = A Z + B along the motions; one array holds all intervals.
+        # Integrate dZ/dt = A Z + B along the motions by Runge-Kutta steps. Z contains the Jacobians
+        # of all intervals.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
@@ -157,7 +163,7 @@ class Shooting:
         return Z, np.concatenate(inside, axis=1)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
-        """Return knots on cubic curves between two points, and approximate inputs for them."""
+        """Return knots q, v on a cubic curve between two points, and approximate inputs u."""
         model, T = self.state.robot.model, self.t[-1]
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
@@ -170,7 +176,7 @@ class Shooting:
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
         difference[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
         # The final rate of the rotation vector is a least-squares solution, because the Jacobian of
-        # the rotation vector is singular after full rotations about the axis.
+        # the exponential map is singular after full rotations about the axis.
         jacobian = pin.Jexp3(difference[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
         late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference

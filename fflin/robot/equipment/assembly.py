@@ -367,11 +367,11 @@ def _mounted_modes(
 
 
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
-    """Return {mode: effective masses and moments of inertia (6,)} along the frame's axes.
+    """Return the effective masses and moments of inertia (6,) of each mode, as {mode: values}.
 
-    Each value is a fraction of the corresponding mass or moment of the rigid inertia, about the
-    origin of the appendage's frame. The rigid inertia is from the file of the appendage. If there
-    is no file, it is the inertia of the carrying body.
+    The values are along the axes of the appendage's frame and about its origin. Each value is a
+    fraction of the corresponding mass or moment of the rigid inertia. The rigid inertia is from the
+    file of the appendage. If there is no file, it is the inertia of the carrying body.
     """
     found: dict[str, Array] = {}
     for item in appendages:
