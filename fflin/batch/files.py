@@ -200,7 +200,7 @@ class MemoryStore:
         return {key: self.arrays[key][start:stop] for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
-        """Keep a finished chunk."""
+        """Save the rows and results of a finished chunk."""
         for key, rows in self.view(start, stop, self.arrays).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
@@ -297,7 +297,7 @@ class FileStore:
         return {key: np.empty((stop - start, *self._shapes[key])) for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
-        """Keep a finished chunk."""
+        """Save the rows and results of a finished chunk."""
         with self._reported():
             for key in self._shapes:
                 self._file[key][start:stop] = arrays[key]

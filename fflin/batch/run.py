@@ -121,7 +121,7 @@ def run_chunks(
 
     If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If the
     store is in memory, `made` converts the rows and results of the other chunks to the attribute
-    `batch` of this error. Without `made`, the first failure raises `FflinError`.
+    `batch` of this error. Without `made`, the first failure ends the call with `FflinError`.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):

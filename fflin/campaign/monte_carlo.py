@@ -283,7 +283,7 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign in a file that this call wrote earlier, or None if there is no file.
+    """Return the campaign that an earlier identical call wrote, or None if there is no file.
 
     Raise `FileError` if a different call wrote the file.
     """

@@ -124,7 +124,7 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
 def state_of(
     robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None]:
-    """Combine `states` with the options of a command; return q (nq,) and v (nv,) or None.
+    """Combine `states` with the options of a command; return q (nq,), and v (nv,) or None.
 
     Later states override earlier states, and options override all states. The options are --joint,
     --rpy, --position and --velocity. Their names can have a prefix, such as ``target_``. A joint
@@ -234,8 +234,8 @@ def robot_of_design(
 ) -> fflin.Robot:
     """Return the robot of a design; for allocation, a base torque and force replace thrusters.
 
-    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base, and
-    if `law`, when it is given, commands a base torque.
+    If `allocate` is None, thrusters are allocated under two conditions: they can produce every
+    wrench on the base, and the given `law`, if any, commands a base torque.
     """
     if allocate is None:
         from fflin.control.authority import thrusters_give_every_wrench
