@@ -118,8 +118,8 @@ def read_rows(
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
     """Read a file; return its arrays, the names of its constant arrays, its strings, and a flag.
 
-    The flag is true if the checksums were verified. All rows of a constant array are the same, so
-    the file contains, and the function returns, a single row without the axis of the rows.
+    The flag is true if the checksums were verified. All rows of a constant array are the same. Only
+    one of these rows is stored, and this row is returned in place of the array.
     """
     writing.check_ending(path, FORMATS)
     if path.suffix == ".npz":
@@ -307,7 +307,7 @@ class FileStore:
             self._file.flush()
 
     def complete(self) -> dict[str, Array]:
-        """Add the checksum of the whole file, give it its final name, and return its arrays."""
+        """Add the checksum of the whole file, rename the file, and return its arrays."""
         with self._reported():
             checksums = self._file[CHUNK_CHECKSUMS][:]
             self._file[CHECKSUM][:] = file_checksum(

@@ -68,8 +68,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    # `load` gets these two settings, because its warnings depend on them. All other settings are
-    # applied after loading.
+    # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
+    # settings are applied after loading.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
@@ -100,7 +100,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 def limits_of_options(
     arguments: Namespace,
 ) -> list[str | dict[str, float]] | dict[str, float] | None:
-    """Return the limits of the inputs that the options --limits and --limit define."""
+    """Return the limits that the options --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 

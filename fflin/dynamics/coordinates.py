@@ -37,19 +37,18 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     **dict.fromkeys(ORBITAL, (False, True)),
 }
 
-# Entries of the base's angular part and linear part in vectors (6 + n,) in state order: velocities
-# and generalised forces.
+# Slices of the base's angular and linear parts in velocities and generalised forces (6 + n,) in
+# state order.
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# Entries of the same two parts in Pinocchio's v and spatial vectors, in which the linear part is
-# first.
+# Slices of the same two parts in Pinocchio's v and spatial vectors, where the linear part is first.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
 def frame_of(robot: Robot, frame: object) -> Frame:
     """Return the frame, or the default frame of the robot if `frame` is None.
 
-    Raise `InputError` for an unknown frame, for an orbital frame without an orbit, and for another
-    frame in orbit.
+    Raise `InputError` for an unknown frame, for an orbital frame without an orbit, and for any
+    other frame in orbit.
     """
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
@@ -107,8 +106,8 @@ def forces_of(robot: Robot) -> dict[str, str]:
     return _axes_of(tau_b=BaseTorque.UNIT, F_b=BaseForce.UNIT) | tau_m
 
 
-# If q0 = sqrt(1 - |q_b|^2) is below the square root of the machine epsilon, it has no correct
-# digit.
+# If q0 is below the square root of the machine epsilon, q0 = sqrt(1 - |q_b|^2) has no correct digit
+# because of cancellation.
 SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 _IDENTITY = np.eye(3)
@@ -153,20 +152,23 @@ class Chart:
         return 0.5 * omega if self.standing else times(self.N, omega)
 
     def turned(self, columns: Array) -> Array:
-        """Return k vectors, the columns (.., 3, k) in base axes, in reference axes."""
+        """Convert k vectors, the columns of an array (.., 3, k), from base to reference axes."""
         return columns if self.standing else product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of d q_b/dt with respect to q_b (4.2).
 
-        omega is in base axes and constant, and `crossed` is [omega]x.
+        omega is constant in base axes, and `crossed` is [omega]x.
         """
         if self.standing:
             return -0.5 * crossed
         return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Convert derivatives (.., k, 3) from small base rotations d theta to q_b (1.3)."""
+        """Convert derivatives (.., k, 3) with respect to d theta to ones with respect to q_b.
+
+        d theta is a small rotation of the base in base axes (1.3).
+        """
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
@@ -178,16 +180,16 @@ class Chart:
         _turn(self.R, () if self.standing else parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with the rows of `parts` (three rows each) in reference axes.
+        """Return x (.., m, k) after conversion of the rows of `parts` to reference axes.
 
-        In the given x, these rows are in base axes.
+        Each part has three rows, which are in base axes in the given x.
         """
         return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with the rows of `parts` (three rows each) in base axes.
+        """Return x (.., m, k) after conversion of the rows of `parts` to base axes.
 
-        In the given x, these rows are in reference axes.
+        Each part has three rows, which are in reference axes in the given x.
         """
         return x if self.standing or not parts else _turn(self.R.mT, parts, x.copy("K"))
 
@@ -227,7 +229,7 @@ def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
     """Remove full turns of continuous joints from states or state errors x (.., nx), in place.
 
     Afterwards, the angle of each continuous joint is within half a turn of its value in `near`
-    (nx,), or of the number `near`. Return x.
+    (nx,). If `near` is a number, it is the value for all joints. Return x.
     """
     joints = 6 + state.unbounded
     apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
@@ -321,9 +323,9 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def _apart(x: Array, target: Array) -> tuple[Array, Array]:
-    """Return the quaternions of the rotations from the attitudes of `target` to those of x.
+    """Return the rotation from the target attitude to the attitude of each state in x (N, nx).
 
-    The result is their vector parts (N, 3) and scalar parts (N, 1).
+    The rotations are unit quaternions, with vector parts (N, 3) and scalar parts (N, 1).
     """
     at, to = x[:, :3], target[..., :3]
     w, d = (
@@ -375,7 +377,7 @@ def _turned(x: Array) -> tuple[Array, Array]:
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the state indices (3,) of each base velocity that `frame` has in reference axes."""
+    """Return the state indices (3,) of each base velocity that is in reference axes in `frame`."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -195,7 +195,7 @@ def struck(
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
-    """Return the joint-space inertia M (nv, nv) at a configuration, in the order of v."""
+    """Return the joint-space inertia M (nv, nv) at a configuration, for Pinocchio's v."""
     return np.asarray(pin.crba(robot.model, robot.create_data(), q.copy()))
 
 
@@ -208,7 +208,7 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
 
 
 def joint_called(robot: Robot, name: str) -> pin.JointModel:
-    """Return Pinocchio's joint of a robot by its name."""
+    """Return the joint of a given name from the Pinocchio model of a robot."""
     return robot.model.joints[robot.model.getJointId(name)]
 
 

@@ -22,10 +22,11 @@ def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
 
 
 class Integrator:
-    """Integrator with a fixed step size for one model. It steps one q and v, or N rows of them."""
+    """Integrator of one model with a fixed step size, for one q and v, or for N rows of q and v."""
 
-    # A step of length h starts at q and v. Its stages evaluate the accelerations l1, l2, ...
-    # Times of the stages for h = 1.
+    # A step of length h starts at q and v. The accelerations at its stages are l1, l2, and so on.
+
+    # Times of the stages if h = 1.
     nodes: ClassVar[tuple[float, ...]]
     # Weights of l1, l2, ... in the integral of the acceleration: the step changes v by h times the
     # weighted sum.
@@ -33,7 +34,7 @@ class Integrator:
     # Weights of l1, l2, ... in the double integral of the acceleration: the step changes the
     # position of a point by h v plus h^2 times the weighted sum.
     moments: ClassVar[tuple[float, ...]]
-    # Stability limit: the largest stable h |pole| of a negative real pole.
+    # Stability limit: a negative real pole is integrated stably up to this value of h |pole|.
     reach: ClassVar[float]
     # After each stage, a displacement leads to the next configuration. The displacement starts from
     # the configuration of the stage with this index: 0 for the first stage, 1 for the second.
@@ -55,8 +56,8 @@ class Integrator:
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
         """Return the weights of v, l1, l2, ... for a step of dt [s].
 
-        The rows of the first result are the displacements of q, and the rows of the second result
-        are the new velocities.
+        The first result has one row of weights for each displacement of q. The second result has
+        one row for each new velocity.
         """
         displacement, speed = np.array(cls.displacements), np.array(cls.speeds)
         displacement[:, 0] *= dt
@@ -129,8 +130,8 @@ def integrator(name: str) -> type[Integrator]:
 
 
 # Commutator-free method of order four (10.3): its two Gauss points, and the weights alpha (HEAVY)
-# and beta (LIGHT). In the first exponential, the first Gauss point has the weight HEAVY. In the
-# second exponential, the second Gauss point has this weight.
+# and beta (LIGHT). In the exponential that acts first, the first Gauss point has the weight HEAVY.
+# In the other exponential, the second Gauss point has this weight.
 GAUSS = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
@@ -160,8 +161,9 @@ def held_derivatives(
 
     dA (.., n, n) is the change of A, and d_driven (.., n, k) is the change of `driven`.
     """
-    # The change dx of x satisfies d(dx)/dt = A dx + dA x + d_driven u. With dx/dt = A x + driven u,
-    # this is a linear system with the state (dx, x).
+    # `held_exponential` solves dx/dt = A x + driven u. The change dx of the solution satisfies
+    # d(dx)/dt = A dx + dA x + d_driven u. Both equations together are a linear system with the
+    # state (dx, x).
     n = len(A)
     both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
     both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
@@ -171,7 +173,7 @@ def held_derivatives(
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]; F and h may have leading axes."""
+    """Return the integral of e^(F^T t) W e^(F t) over [0, h]; F and h may have leading axes."""
     # In a matrix exponential, the rounding errors of all blocks are relative to the largest block.
     # So W is scaled to the size of F.
     from scipy.linalg import expm

@@ -27,8 +27,8 @@ def mean_motion(robot: Robot) -> float:
     return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
-# Limits of the relative error of the linear gravity field (14.1). Above _COARSE, a warning is
-# given. Above _USELESS, an error is raised.
+# Limits of the relative error of the linear gravity field (14.1). Above `_COARSE`, a warning is
+# given. Above `_USELESS`, an error is raised.
 _COARSE, _USELESS = 0.01, 0.5
 
 
@@ -72,8 +72,8 @@ class OrbitField:
     def require_near(self, q: Array) -> None:
         """Check that the robot is near the origin of the orbital frame, where (14.1) is accurate.
 
-        If the robot may extend too far, give a warning. If it may extend much too far, raise
-        `InputError`.
+        Warn if the relative error at the robot may exceed `_COARSE`. Raise `InputError` if it may
+        exceed `_USELESS`.
         """
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
         error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
@@ -159,7 +159,7 @@ class OrbitField:
         return q, v
 
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
-        """Convert derivatives of inertial accelerations to derivatives of the relative ones.
+        """Convert derivatives of inertial accelerations to derivatives of relative accelerations.
 
         The given `by_q` and `by_v` hold at the point that `near` returns for q and v. They are
         changed in place to the derivatives of (14.2) at q and v.
@@ -180,9 +180,9 @@ class OrbitField:
         by_v[LINEAR, LINEAR] -= 2.0 * spin + W
 
     def potential(self, data: pin.Data) -> float:
-        """Return the potential energy [J] of a robot without springs in the orbital frame (14.3).
+        """Return the potential energy [J] in the orbital frame, without the energy of springs.
 
-        It includes the term of wheels that are modelled by a constant momentum.
+        It is the sum of the integral and of the term of wheels with a constant momentum in (14.3).
         """
         # Without these wheels, the potential energy is -1/2 times the integral of x^T G x over the
         # mass of the robot. The matrix G of this function is `pull`, which is K in (14.3).
@@ -198,7 +198,7 @@ class OrbitField:
     def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
         """Return the attitudes (k, 3, 3) and the centres of mass (k, 3, 1) of the k bodies.
 
-        Both are in the orbital frame.
+        They are in the orbital frame.
         """
         placements = data.oMi.tolist()[ROOT:]
         R = np.array([placement.rotation for placement in placements])

@@ -180,7 +180,7 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
-    # These two terms are the derivatives of -g, which is constant in world axes, and of
+    # The next terms are the derivatives of -g, which is constant in world axes, and of
     # omega_b x v_b.
     of_base = by_a[:, PIN_LINEAR]
     to.by_q[:, PIN_ANGULAR] -= of_base.dot(skew(at.g))
@@ -227,7 +227,8 @@ class Sensing:
     ) -> None:
         robot = state.robot
         self.state, self._own_reference = state, own_reference
-        # The model may place its free-flyer joint away from the world's origin.
+        # This q[:7] places the base at the world's origin, even if the model places its free-flyer
+        # joint elsewhere.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
         # (index in y, index in the state) for each output that is a state.
@@ -320,7 +321,7 @@ class Measuring:
         self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
 
     def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
-        """Return y (ny,) at the state x and the same point (q, v).
+        """Return y (ny,) at a point, which is given as the state x and also as q and v.
 
         `a` (nv,) is dv/dt as Pinocchio's ABA returns it.
         """

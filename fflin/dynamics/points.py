@@ -84,7 +84,7 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     """Merge two mappings as in `base_of`; entries of `other` replace entries of `state`.
 
-    In the parts "joints" and "velocity", single joints and rates are replaced.
+    In "joints" and "velocity", only the joints and rates that `other` names are replaced.
     """
     both = {**state, **other}
     for part in ("joints", "velocity"):
@@ -94,7 +94,10 @@ def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 
 
 def start_of(robot: Robot) -> tuple[Array, Array]:
-    """Return the initial configuration (nq,) and velocity (nv,): `start`, completed by `point`."""
+    """Return the initial configuration (nq,) and velocity (nv,) of a robot.
+
+    They are given by `robot.start`. Values that are missing there are taken from `robot.point`.
+    """
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
     rates = start.get("velocity")

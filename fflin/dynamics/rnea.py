@@ -21,8 +21,8 @@ from fflin.robot.mass_properties import coordinate_names
 # of these two inertias, and is 1 for a decoupled coordinate. The relative error of (M^-1)_ii is
 # about the coupling times machine epsilon. If the sum of all couplings exceeds WARNING_COUPLING,
 # M^-1 has fewer than nine correct digits. If the sum exceeds _LARGEST_COUPLING, M^-1 has fewer than
-# two. Exact couplings are at least 1. So if the computed sum is less than the number of
-# coordinates, some pivots of M are only rounding errors.
+# two correct digits. Exact couplings are at least 1. So if the computed sum is less than the number
+# of coordinates, some pivots of M are only rounding errors.
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
@@ -75,12 +75,12 @@ class Inertia:
         """Write M^-1 (6 + n, 6 + n) at a configuration into the C-contiguous array `out`.
 
         The configuration is not checked. If `quick` is true, the articulated-body inverse is used
-        where it is accurate.
+        at configurations at which it is accurate.
         """
         still = self.centred(q)
         # The rounding errors of the articulated-body inverse would appear in entries of M^-1 K that
-        # should be exactly zero, where K is the stiffness. The relative rounding errors of a
-        # Cholesky factor are smaller, because they do not depend on the scaling of M.
+        # should be exactly zero, where K is the stiffness. So robots with springs need a Cholesky
+        # factor, whose relative rounding errors do not depend on the scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
@@ -240,10 +240,10 @@ class Accelerations:
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # The pose of the base is neutral and its linear velocity zero here, because c does not
-        # depend on them. Large values would also make Pinocchio's derivatives less accurate.
-        # Gravity is zero as well, because uniform gravity accelerates all parts of the robot alike
-        # (equivalence principle).
+        # Here, the base is in its neutral pose and has no linear velocity, because c does not
+        # depend on its pose and linear velocity. Large values would make Pinocchio's derivatives
+        # less accurate. Gravity is zero as well, because uniform gravity accelerates all parts of
+        # the robot alike (equivalence principle).
         q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:
@@ -296,7 +296,7 @@ class Accelerations:
     ) -> tuple[pin.StdVec_Force, Array, Array, Array]:
         r"""Return the gyroscopic torques :math:`h \times \omega` of wheels without inertia (6.3).
 
-        The four results are
+        The four results are:
 
         - the wrenches on all joints, to which the gyroscopic torques are added;
         - the generalised force (nv,) of the gyroscopic torques;

@@ -107,8 +107,8 @@ class StateMap:
         joints = robot.joints
         # For each velocity of the state, its index in Pinocchio's v.
         self._order = np.array([3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp)
-        # For each entry of Pinocchio's v, the index of the velocity of the state. Mimic joints have
-        # no such velocity; `spread` overwrites their entries.
+        # For each entry of Pinocchio's v, the index of this velocity in nu. Mimic joints have no
+        # velocity in nu, and `spread` writes their entries of v afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
@@ -433,8 +433,9 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques in state order, so that B_u is the
         # identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
-        # One item for each joint with such inputs: (joint, indices of the k inputs that are mounted
-        # on it, wrenches (6, k) of unit inputs in the frame of the joint).
+        # One item for each joint on which thrusters, or wheels without a joint of their own, are
+        # mounted: (joint, indices of these k inputs, wrenches (6, k) of unit inputs in the frame of
+        # the joint).
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
         self._of_carried: list[int] = []
         for joint, items in carried.items():
@@ -463,10 +464,10 @@ class Actuation:
         return chart.to_base(self.held, u[..., None])[..., 0]
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return, for each joint, the wrench of the thrusters and wheels that are mounted on it.
+        """Return the wrenches of thrusters and wheels on all joints, in the frames of the joints.
 
-        Each wrench is in the frame of its joint. The result is None if no input is mounted on a
-        joint in this way.
+        Wheels with a joint of their own are not included. The result is None if the robot has no
+        other wheels and no thrusters.
         """
         if not self.carried:
             return None

@@ -50,9 +50,9 @@ class Law:
     """Control law, converted to the tables of its C code, with test cases.
 
     A state law is ``u = u0 - K (x - x0)``. Its tables have one row for all samples, or one row for
-    each sample. If there is a table `axis_points`, K is interpolated between joint positions, and
-    the table contains the positions of the grid. An output law is ``u = u0 + C z + D (y - y0)``.
-    The next controller state z is ``A z + B (y - y0)``.
+    each sample. If there is a table `axis_points`, it contains a grid of joint positions, on which
+    K is interpolated. An output law is ``u = u0 + C z + D (y - y0)``. The next controller state z
+    is ``A z + B (y - y0)``.
     """
 
     title: str

@@ -38,7 +38,8 @@ class LeastSquares(
 
     The other fields are work space:
 
-    - `A`: the vectors of `columns` for one lane. The first k are divided by their common norm.
+    - `A`: the vectors of `columns` for one lane. The first k are divided by the norm of the matrix
+      that they form.
     - `Q`, `R`: QR factors of a matrix with one column for each free input. A column contains the
       force of this input from `A`, and then k entries: `LEAST` for this input and zeros.
     - `order`: the free inputs, in the order in which they became free.
@@ -50,10 +51,11 @@ class LeastSquares(
 
 
 class Allocation(namedtuple("Allocation", "asking giving point work problem")):
-    """Allocation of commands for the inputs of the robot `asking` to the robot `giving`.
+    """Allocation of commands for the inputs of the robot `asking` to the inputs of `giving`.
 
-    Both are the same robot with different inputs. `point` holds q, and the inputs first of `asking`
-    and then of `giving`. `work` is work space. If `problem` has no inputs, nothing is allocated.
+    The two robots differ only in their inputs. `point` holds q and inputs: first the inputs
+    of `asking`, later the inputs of `giving`. `work` is work space. If `problem` has no inputs,
+    nothing is allocated.
     """
 
 
@@ -169,7 +171,7 @@ def allocate(allocation, point, commanded):
     write_columns(work, tree)
     vec.copy(commanded, 0, own.pushing, 0, len(commanded))
     _write_force(work, asking, own, columns, count * size)
-    # Write the generalised forces of unit inputs, one after the other.
+    # Write the generalised forces of unit inputs of `giving`, one after the other.
     write_columns(work, giving.tree)
     for unit in range(count):
         for index in range(count):
@@ -199,7 +201,7 @@ def _write_force(work, robot, point, columns, at):
 
 @called
 def solve(problem, size, lane):
-    """Write the solution of a problem for one lane to its x; x is NaN if the force is NaN."""
+    """Write the solution for one lane to `problem.x`; it is NaN if the force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count = problem.least, problem.most, len(problem.least)
     write_scaled(problem.columns, lane, 1.0, A)
@@ -342,7 +344,7 @@ def nearest(A, b, least, most):
     If several u are equally near, the smallest u is returned.
     """
     numbers, size = [0.0] * len(least), len(b)
-    # Lists are used because reading an entry of a list is faster than reading one of an array.
+    # Reading an entry is faster for lists than for arrays, so lists replace the work arrays.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(
         columns=np.concatenate((A.T.ravel(), b)),
         state=[0] * len(least),

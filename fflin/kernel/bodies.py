@@ -21,8 +21,8 @@ from fflin.kernel.vectors import load, store
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 # Offsets of the loads of the subtree beyond each joint. The momentum p, the columns of G and the
 # stored momentum h are defined in `kernel.derivatives`. FORCE is the moment and force that the
-# motion of the subtree requires, first for c = 0. CARRIED is the moment and force that c requires;
-# `accelerate_bodies` adds it to FORCE.
+# motion of the subtree requires for c = 0. CARRIED is the moment and force that c requires;
+# `accelerate_bodies` adds CARRIED to FORCE.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
 
@@ -222,9 +222,9 @@ def motion_cross(velocity, along):
 
 
 def at_joint(work, at, place):
-    """Return the parent's motion vector, which is at the offset `at`, at the joint's origin.
+    """Return a motion vector of the parent, shifted from the parent's origin to the joint's origin.
 
-    `place` is the offset of the joint's pose.
+    `at` is the offset of the motion vector, and `place` is the offset of the joint's pose.
     """
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
@@ -320,7 +320,7 @@ def collect_momenta(work, tree):
 
 
 def stored_momentum(work, tree, index):
-    """Return the stored momentum with an index, in base axes."""
+    """Return the stored momentum number `index`, in base axes."""
     axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
     return vec.product(axes, vec.get3(tree.stored, 3 * index))
 

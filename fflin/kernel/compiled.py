@@ -75,7 +75,7 @@ def numba_is_there() -> bool:
 
 
 def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
-    """Return whether to use compiled code: `engine` is not "python", and there is no obstacle.
+    """Return True if compiled code is used: `engine` is not "python", and there is no obstacle.
 
     `obstacle` returns the reason why compiled code cannot be used, or an empty text. Raise an error
     for an unknown engine, and for the engine "compiled" if there is an obstacle.
@@ -174,7 +174,7 @@ def _between_processes(path: Path) -> ExitStack:
 
 
 def is_kept(module: str, name: str) -> bool:
-    """Return whether machine code of a function that fits the current sources is on disk."""
+    """Return whether the disk has machine code of a function, compiled from the current sources."""
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_stored(folder, module, name)[0] for folder in folders)

@@ -116,7 +116,7 @@ def push(work, tree, pushing):
     """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
 
     Torques and forces on the base in `pushing` are in base axes. `bodies.write_columns` must be
-    called before, because `push` reads the columns that it writes.
+    called before `push`, which reads the columns of body-fixed inputs.
     """
     size, count = len(tree.row), len(tree.wrench_body)
     vec.clear(work, tree.c, size)
@@ -160,8 +160,7 @@ def accelerate(work, robot, point, rates, to):
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Offsets in `sums` of `MomentumReference`. IMPULSE and SHIFT are for the time up to the current
-# step, STEP_IMPULSE and STEP_SHIFT are for the current step.
+# Offsets of the four vectors in `sums` of `MomentumReference`.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
@@ -175,9 +174,9 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
       Angular momentum and centre of mass are relative to this point.
     - `weight` (3,): mass times gravity.
     - `per_mass` (1,): 1 / mass.
-    - `sums` (18,): the impulse (6,) up to the current step, and the displacement (3,) of the centre
-      of mass by this impulse. Then the impulse (6,) within the step, and the mass times the
-      displacement (3,) by it.
+    - `sums` (18,): four vectors. The first two are for the time before the current step: impulse
+      (6,), and displacement (3,) of the centre of mass by the impulse. The other two are for the
+      current step: impulse (6,), and displacement (3,) multiplied by the mass.
     """
 
 
@@ -205,7 +204,7 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 
 def end_step(reference, h):
-    """Add the sums of a finished step of h [s] to the sums before it; set the sums of a step to 0.
+    """Finish a step of h [s]: add its sums to the sums before it, and set its sums to zero.
 
     The impulse before the step also displaces the centre of mass during the step.
     """
