@@ -118,8 +118,8 @@ def read_rows(
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
     """Read a file; return its arrays, the names of its constant arrays, its strings, and a flag.
 
-    The flag is true if the checksums were verified. All rows of a constant array are the same, so
-    the file contains, and the function returns, a single row without the axis of the rows.
+    The flag is true if the checksums were verified. All rows of a constant array are the same. Only
+    one of these rows is stored, and this row is returned in place of the array.
     """
     writing.check_ending(path, FORMATS)
     if path.suffix == ".npz":
@@ -200,7 +200,7 @@ class MemoryStore:
         return {key: self.arrays[key][start:stop] for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
-        """Keep a finished chunk."""
+        """Save the rows and results of a finished chunk."""
         for key, rows in self.view(start, stop, self.arrays).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
@@ -297,7 +297,7 @@ class FileStore:
         return {key: np.empty((stop - start, *self._shapes[key])) for key in names}
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
-        """Keep a finished chunk."""
+        """Save the rows and results of a finished chunk."""
         with self._reported():
             for key in self._shapes:
                 self._file[key][start:stop] = arrays[key]
@@ -307,7 +307,7 @@ class FileStore:
             self._file.flush()
 
     def complete(self) -> dict[str, Array]:
-        """Add the checksum of the whole file, give it its final name, and return its arrays."""
+        """Add the checksum of the whole file, rename the file, and return its arrays."""
         with self._reported():
             checksums = self._file[CHUNK_CHECKSUMS][:]
             self._file[CHECKSUM][:] = file_checksum(

@@ -169,8 +169,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     nv, nu = batch.B_lower.shape[1:]
     K: Array = np.empty((len(batch), nu, 2 * nv))
     residual, margin = np.empty((2, len(batch)))
-    # If all points are at rest, the batch stores a single A and a single f0. If this f0 is zero,
-    # every point is an equilibrium.
+    # Only a batch of points at rest stores a single A and a single f0 for all points. If this f0 is
+    # zero, every point is an equilibrium.
     at_rest = is_constant(batch.A) and is_constant(batch.f0) and not batch.f0[0].any()
     direct = at_rest and nu >= nv
     for index, L in enumerate(batch.B_lower):

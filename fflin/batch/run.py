@@ -120,8 +120,8 @@ def run_chunks(
     `upto` are computed.
 
     If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If the
-    store is in memory, the attribute `batch` of this error contains the rows and results of the
-    other chunks, as `made` returns them. Without `made`, the first failure raises `FflinError`.
+    store is in memory, `made` converts the rows and results of the other chunks to the attribute
+    `batch` of this error. Without `made`, the first failure ends the call with `FflinError`.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):

@@ -175,7 +175,7 @@ def sweep(
 
 
 def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
-    """Return the compiled kernel for accelerations and their derivatives, or None for Python."""
+    """Return the compiled kernel for accelerations and derivatives, or None if Python is used."""
     robot, tree, reason = prepared.robot, batch_tree(prepared.robot), ""
     if prepared.sensing is not None:
         reason = "the outputs are not the state"

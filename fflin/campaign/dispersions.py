@@ -178,8 +178,8 @@ class Dispersions:
     ) -> tuple[dict[str, tuple[Inverse, str]], dict[str, str]]:
         """Return {link or body: spread}, and {link or body: its key in `spreads`}.
 
-        The second mapping contains only the links and bodies for which a key has no wildcard. Such
-        a key overrides patterns that match the same link or body.
+        The second mapping omits keys with wildcards. A key without a wildcard overrides patterns
+        that match the same link or body.
         """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
         alone, whole = {*robot.pieces, *robot.link_of}, set[int]()
@@ -341,12 +341,13 @@ class Dispersions:
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (count, 1, 1))
             for at, body in self.bodies(drawn).items():
-                # The tree also contains the wheels, so a body has another index than in `_model`.
+                # The tree also contains the wheels, so the index of a body differs from its index
+                # in `_model`.
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The parameters in the tree include the wheels of the body, but the changed body
-                # does not. So only the change of the body is added to the parameters.
+                # The parameters of a body in the tree include its wheels, but `body` and `before`
+                # do not. So only the difference of these two is added to the parameters.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
@@ -430,10 +431,11 @@ def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Arr
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
-    """Return the inertial parameters (N, 10) of bodies along the columns of `axes` (3, 3).
+    """Return the inertial parameters (N, 10) of bodies in the axes of another frame.
 
-    The parameters are the mass m, the first moment m c with the centre of mass c, and six entries
-    (xx xy xz yy yz zz) of the inertia about the origin.
+    The columns of `axes` (3, 3) are the directions of these axes. The parameters are the mass m,
+    the first moment m c with the centre of mass c, and six entries (xx xy xz yy yz zz) of the
+    inertia about the origin.
     """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
@@ -503,7 +505,10 @@ def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | Reactio
 def _mounted(
     robot: Robot,
 ) -> Iterator[tuple[int, Thruster | ReactionWheel, tuple[str, ...], int, Array]]:
-    """Yield (index in `robot.inputs`, item, names, index in u, direction) per thruster or wheel."""
+    """Yield (index in `robot.inputs`, item, names, index in u, direction) for each actuator.
+
+    The actuators are the thrusters and the reaction wheels.
+    """
     first = 0
     for place, (item, names) in enumerate(robot.named_inputs):
         if isinstance(item, Thruster | ReactionWheel):

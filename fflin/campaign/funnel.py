@@ -415,7 +415,7 @@ def _tested(
         """Simulate runs from random errors e with sqrt(e' P e) = `roots`; return the outcomes."""
         e = rng.normal(size=(len(roots), len(P))) @ W.T
         # Scale the errors by their levels and not by the norms of the random vectors, because
-        # components along which P is zero do not contribute to the level.
+        # components in the null space of P do not contribute to the level.
         e *= (roots / np.sqrt(((e @ P) * e).sum(axis=1)))[:, None]
         starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
         return completed(job, starts, how)["outcome"]

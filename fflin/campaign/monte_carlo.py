@@ -283,7 +283,7 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign in a file that this call wrote earlier, or None if there is no file.
+    """Return the campaign that an earlier identical call wrote, or None if there is no file.
 
     Raise `FileError` if a different call wrote the file.
     """
@@ -299,7 +299,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 
 def _header(job: CampaignJob) -> dict[str, object]:
-    """Return the fields of a campaign that are not arrays and follow from its job."""
+    """Return the header of a campaign: the fields that are not arrays and follow from its job."""
     plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
     fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
     for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):

@@ -207,7 +207,7 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw bands over time of the values (N, M) in the runs `of`, and a line per run in `runs`."""
+    """Draw values (N, M) over time: bands of the runs `of`, and one line for each of `runs`."""
     # Infinite values of stopped runs are drawn at the upper edge of the axes. Each bound of a band
     # is the value of one run, because interpolation could mix finite values with this edge.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
@@ -242,9 +242,9 @@ def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
-    """Draw histograms of the errors of completed runs, final and largest, and their percentiles.
+    """Draw histograms of the final and the largest errors, and lines at their percentiles.
 
-    The percentiles include the stopped runs.
+    The histograms include only the completed runs. The percentiles include all runs.
     """
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
     of = {name: campaign.values(name)[~campaign.stopped] for name in names}
@@ -271,7 +271,7 @@ def _inputs(
 ) -> None:
     """Draw the largest magnitude in a group of inputs over time, and the limit of the group.
 
-    Only completed runs are included. The limit is omitted if it is far above these values.
+    The bands include only the completed runs. The limit is omitted if it is far above the inputs.
     """
     largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
     if not campaign.stopped.all():

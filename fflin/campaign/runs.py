@@ -107,7 +107,7 @@ class CampaignJob:
 
     If `given` is None, the drawn values are the deviations (nx,) of the initial state. The function
     `judge` returns the arrays of the result. The condition `over` can end runs early. It needs
-    histories, because it compares the present errors with the first entry, the initial errors.
+    histories, because it reads the initial errors from their first entry.
     """
 
     def __init__(
@@ -289,7 +289,7 @@ class CampaignJob:
         return self.outcome(_recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
-        """Estimate the computing time [s] of `count` runs on one core from a few steps of runs."""
+        """Estimate the time [s] in which one core computes `count` runs, from a few steps."""
         few, plan, drawn, times = copy(self), self.plan, first[: self.lanes], list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}

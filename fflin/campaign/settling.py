@@ -1,8 +1,8 @@
 """Settling of a regulated robot from random displacements, measured with an error norm.
 
 The norm of a deviation z is sqrt(z' P z), where z' P z is a Lyapunov function of the linear loop.
-Its rate of decrease along the linear loop is z' Q z. Q is diagonal, and z' Q z has the unit of
-energy.
+Along the linear loop, this function decreases at the rate z' Q z. Q is diagonal, and z' Q z has the
+unit of energy.
 """
 
 import math
@@ -89,7 +89,8 @@ class Loop:
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
         # `of` and `size` contain square roots of weights. The root for a coordinate is the root for
-        # its velocity times the decay rate of the loop. Some velocities have no coordinate.
+        # its velocity times the decay rate of the loop. The model can contain a velocity without
+        # its coordinate.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)

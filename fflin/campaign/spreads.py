@@ -27,7 +27,7 @@ _EXPECTED = (
 
 
 class DispersionFile(dict[str, object]):
-    """Dispersions {name, group or pattern: spread} from a TOML file, and the parsed file."""
+    """Dispersions {name, group or pattern: spread} from a TOML file, with the parsed file."""
 
     document: TomlFile
 
@@ -162,8 +162,8 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     """Return the inverse distribution function of a spread.
 
     A number is the standard deviation of a normal distribution; if `fixed`, it is the value of all
-    runs. A `partial` object is returned for a closed form of this module. Any other returned
-    function is the method `ppf` of a distribution, and can be slow.
+    runs. A function of this module is returned as a `partial` object. Otherwise, the method `ppf`
+    of the distribution is returned, which can be slow.
     """
     if hasattr(spread, "ppf"):
         try:

@@ -241,7 +241,8 @@ def validity(
         return np.array(x) - loop.start
 
     streams = np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))
-    # The first set of runs measures the prediction error; the second set has random displacements.
+    # The first set of runs measures the prediction error. The second set shows whether the loop
+    # settles from random displacements.
     first = displaced(np.tile(_LEVELS, _DIRECTIONS), streams)
     second = displaced(levels, _DIRECTIONS + np.arange(samples))
     predicting, settling = (
@@ -249,7 +250,8 @@ def validity(
     )
     total = len(first) + samples
     with how:
-        # A random run usually settles after 1 / PATIENCE of the largest duration, and then ends.
+        # A random run usually ends early, because it settles after 1 / PATIENCE of its largest
+        # duration.
         few = math.ceil(samples / PATIENCE)
         expect(progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
         told = progress and partial(_report, progress, 0, total)
@@ -284,9 +286,10 @@ def _report(progress: Progress, before: int, total: int, done: int, _: int) -> N
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the absolute error in the displacement, or NaN if rounding hides it.
+    """Return the order of the absolute error in the displacement, or NaN if it is unknown.
 
-    The order is one more than the order of the relative error, which is fitted.
+    The order is one more than the order of the relative error, which is fitted to the four smallest
+    levels. It is unknown if an error at these levels is not larger than integration errors.
     """
     if not errors[:4].min() > _ROUNDING:
         return np.nan
@@ -300,8 +303,8 @@ def _crossing(errors: Array) -> float:
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # Below the first level, and above the last level without a failed run, the error is assumed
-        # to be proportional to the level.
+        # The error cannot be interpolated below the first level, or if a run at the next level
+        # failed. In these cases, it is assumed to be proportional to the level.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0
@@ -312,7 +315,7 @@ def _crossing(errors: Array) -> float:
 def _checked_displacement(
     lin: LinearModel, attitude: float, position: float, joint: float
 ) -> dict[str, float]:
-    """Return the largest displacement; it is 0 for a quantity that the model has no state of."""
+    """Return the checked displacement, with 0 for each quantity that has no state in the model."""
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
     if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):

@@ -68,8 +68,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    # `load` gets these two settings, because its warnings depend on them. All other settings are
-    # applied after loading.
+    # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
+    # settings are applied after loading.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
@@ -100,7 +100,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 def limits_of_options(
     arguments: Namespace,
 ) -> list[str | dict[str, float]] | dict[str, float] | None:
-    """Return the limits of the inputs that the options --limits and --limit define."""
+    """Return the limits that the options --limits and --limit define."""
     given = once("--limit", arguments.limit)
     return ["urdf", given] if arguments.limits == "urdf" else given or None
 
@@ -124,7 +124,7 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
 def state_of(
     robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
 ) -> tuple[Array, Array | None]:
-    """Combine `states` with the options of a command; return q (nq,) and v (nv,) or None.
+    """Combine `states` with the options of a command; return q (nq,), and v (nv,) or None.
 
     Later states override earlier states, and options override all states. The options are --joint,
     --rpy, --position and --velocity. Their names can have a prefix, such as ``target_``. A joint
@@ -234,8 +234,8 @@ def robot_of_design(
 ) -> fflin.Robot:
     """Return the robot of a design; for allocation, a base torque and force replace thrusters.
 
-    If `allocate` is None, thrusters are allocated if they can produce every wrench on the base, and
-    if `law`, when it is given, commands a base torque.
+    If `allocate` is None, thrusters are allocated under two conditions: they can produce every
+    wrench on the base, and the given `law`, if any, commands a base torque.
     """
     if allocate is None:
         from fflin.control.authority import thrusters_give_every_wrench

@@ -214,7 +214,7 @@ def plain(value: object) -> object:
 
 
 def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
-    """Raise `FileError` if -o would replace a file without a result of one of these kinds."""
+    """Raise `FileError` if `path` is a file that contains no result of one of these kinds."""
     if path.suffix == ".csv" and "LinearModel" in kinds:
         from fflin.linear.files import foreign_table
 

@@ -93,7 +93,7 @@ def joint_or_all(text: str) -> tuple[str | None, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE or NAME; without a value, return None, which means the neutral position."""
+    """Read NAME=VALUE or NAME; the value of NAME alone is None, for the neutral position."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -287,10 +287,10 @@ class Command(argparse.ArgumentParser):
 def add_command(
     commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], object]
 ) -> None:
-    """Add a command and its options. The function `run` executes the command and gives its name.
+    """Add a command and its options. The command has the name of the function `run`.
 
-    The docstring of `run` is the help text: a summary and an example. ``--help`` lists --json and
-    the options in `COMMON`; ``--help all`` lists all options.
+    The function executes the command, and its docstring is the help text: a summary and an example.
+    ``--help`` lists --json and the options in `COMMON`; ``--help all`` lists all options.
     """
     name, (summary, _, example) = run.__name__, (run.__doc__ or "").partition("\n\n")
     command = commands.add_parser(

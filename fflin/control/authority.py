@@ -18,7 +18,7 @@ from fflin.robot.robot import Robot
 _FACETS = 20_000  # normals computed together
 _MANY = 36  # thrusters; their zonotope has 400 000 facets
 
-# A relative value below this is rounding error.
+# A value below this, relative to the largest value, counts as rounding error.
 _ROUNDING = 1e-9
 
 _AXES = "xyz"
@@ -167,7 +167,7 @@ def gives_every_wrench(W: Array, pushing: Mask) -> bool:
 
 
 def thrusters_give_every_wrench(robot: Robot) -> bool:
-    """Return whether all inputs of a robot together, with its thrusters, can produce every wrench.
+    """Return whether the inputs of a robot with thrusters can produce every wrench.
 
     Return False if the robot has no thrusters.
     """
@@ -180,7 +180,7 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
-    r"""Return the largest magnitude r of wrench that the inputs can produce in every direction.
+    r"""Return the largest wrench magnitude r that the inputs can produce in every direction.
 
     The directions are the vectors ``kept d`` with unit vectors d. For each of them, some inputs u
     within their limits satisfy ``W u = r kept d``, and r is the largest number with this property.

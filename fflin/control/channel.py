@@ -41,8 +41,8 @@ def saturation(
 ) -> Saturation:
     """Return the saturation at q, for integration steps of dt [s] and `sample` steps per sample.
 
-    `sample` is 0 for continuous commands. If `pulsed` is True, pulsed thrusters realise their
-    commands by pulses; otherwise, their thrust is continuous.
+    `sample` is 0 for continuous commands. If `pulsed` is True, pulsed thrusters fire
+    pulses. Otherwise, they follow their commands without pulses.
     """
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
@@ -167,7 +167,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 def channelled(
     law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
 ) -> Inputs:
-    """Return a function f(step, *point) that returns the inputs (nu,) after a channel.
+    """Return a channel as a function f(step, *point) that returns the inputs (nu,) of a step.
 
     f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds (k,) of the
     wheels whose speed is limited.

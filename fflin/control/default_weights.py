@@ -42,9 +42,9 @@ _IDLE = 1e-12
 # because the bandwidth depends on the inertia M + B / w, which depends on the bandwidth w.
 _PASSES = 4
 
-# Largest number of bandwidths that `_slowed` tries. If an effort limit is exceeded at all of them,
-# `_slowed` chooses the highest bandwidth whose factor `left` is at least _IN_VAIN times the largest
-# factor, because a lower bandwidth would hardly reduce the excess.
+# Largest number of bandwidths that `_slowed` tries. The effort limits permit about `left` times
+# each bandwidth. If they permit none of the bandwidths, `_slowed` chooses the highest one whose
+# `left` is at least _IN_VAIN times the largest `left`. A lower one would hardly reduce the efforts.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # The report names a mode if its decay rate is below this fraction of the nominal decay rate, which
@@ -99,14 +99,14 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return the viscous damping matrix B (m, m) of (10.7), which is zero for a sampled model."""
+    """Return the viscous damping matrix B (m, m), which is zero for a sampled model."""
     m = len(lin.M)
     if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # The damping rates of gyroscopic coupling and of orbital motion sum to zero, because these do
-    # not dissipate energy. If the rates of a model sum to zero, the model counts as undamped.
+    # The damping rates of gyroscopic coupling and of orbital motion sum to zero, because neither
+    # dissipates energy. If the rates of a model sum to zero, the model counts as undamped.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -117,7 +117,7 @@ def _damping(lin: LinearModel) -> Array:
 def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
-    """Return the weights for the inertia M (m, m), which includes the damping term B / w of (10.7).
+    """Return the weights (10.7) for the inertia M (m, m), which includes the damping term B / w.
 
     `inverse` (m, m) maps the rates of the coordinates to the velocities of the model.
     """
@@ -238,8 +238,8 @@ def _fastest(
 
     The bandwidth is 1 rad/s. T (k, m) maps the rates of the modes to the speeds.
     """
-    # A mode x obeys ``mass x'' + most x' + rates^2 x = 0``. Without dampers, `mass` (m,) is 1. With
-    # dampers, it is smaller.
+    # Each mode x obeys ``mass x'' + most x' + rates^2 x = 0``. Without dampers, `mass` (m,) is 1.
+    # With dampers, it is smaller.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)

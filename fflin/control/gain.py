@@ -241,9 +241,9 @@ def make_gain(
     N: Array,
     weights: str = "as given",
 ) -> Gain:
-    """Return the gain of `lin` from the Riccati solution of `part`, a model with fewer states.
+    """Return the gain of `lin` from the Riccati solution of `part`.
 
-    The gain of the other states is zero.
+    `part` is `lin` or a model with some of its states. The gain of the other states is zero.
     """
     S = selection(part.state_names, lin.state_names)
     return Gain._of(

@@ -27,15 +27,16 @@ from fflin.robot.robot import Robot
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
 
-# A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds this times
-# (1 + the largest pole magnitude).
+# A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds
+# _ROUNDING * (1 + largest pole magnitude).
 _ROUNDING = 1e-6
 
 
 class System(NamedTuple):
     """State-space system A, B, C, D with the names of its inputs and outputs.
 
-    The sample time dt [s] is 0 in continuous time, -1 if it is unknown, and None if not given.
+    The sample time dt [s] is 0 in continuous time, -1 for a sampled system with unknown sample
+    time, and None if it is not given.
     """
 
     A: Array

@@ -345,10 +345,10 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return three matrices, which predict the errors, z and the limited values over N stages.
+    """Return three arrays, which predict the errors, z and the limited values over N stages.
 
     z is the scaled difference between the inputs d and the inputs -K e of the regulator, so that
-    ``d = L z - K e``. Each matrix has N nu + nx columns. The first N nu columns multiply z if
+    ``d = L z - K e``. Each array has N nu + nx columns. The first N nu columns multiply z if
     `planned` is True, and d otherwise. The last nx columns multiply the initial error.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]

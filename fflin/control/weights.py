@@ -31,7 +31,7 @@ _Given: TypeAlias = tuple[float, str, bool]
 # is at most this times the largest entry.
 _ROUNDING = 1e-9
 
-# Bandwidth of the wheel speeds, relative to the bandwidth of the loop.
+# Bandwidth with which wheel speeds are regulated, relative to the bandwidth of the loop.
 _SPEEDS = 0.1
 
 
@@ -271,9 +271,9 @@ def rule_weights(
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
     if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
-        # A common factor of Q and R does not change the gain. In Bryson's rule, a signal costs 1 at
-        # its largest value. The rule's weights are scaled so that the signals with a given largest
-        # value also cost 1 at the rule's largest values, in the geometric mean.
+        # A common factor of Q and R does not change the gain. By Bryson's rule, a signal costs 1 at
+        # the largest value that the user gave for it. The rule's weights are scaled likewise: at
+        # the rule's largest values, the geometric mean of the costs of these signals is 1.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
         scale = math.exp(-np.log(costs).mean()) if costs else 1.0
         Q, R = scale * Q, scale * R
@@ -302,8 +302,8 @@ def _of_regulated(
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
-    # A wheel that is already at its speed limit gets the room of a wheel at rest, and the report
-    # names the wheel.
+    # For a wheel that is already at its speed limit, `room` is computed as for a wheel at rest. The
+    # report names the wheel.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
     momenta = dict(zip(names, room, strict=True))
     Q, R, rule, bandwidth, terms = default_weights(body, pace, momenta)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from textwrap import shorten
@@ -307,11 +308,15 @@ def motion_record(motion: Motion) -> dict[str, object]:
     """Return the values of the report as {name: value}, for --json."""
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
+    errors = error_sizes(motion)
+    # Revolute and prismatic joints have errors of the same title in two units.
+    count = Counter(each.title for each in errors)
+    keys = [f"{x.title} [{x.unit}]" if count[x.title] > 1 else x.title for x in errors]
     return {
         **{name: getattr(motion, name) for name in own},
         "duration": t[-1],
         "rows": len(t),
-        "errors": {each.title: each for each in error_sizes(motion)},
+        "errors": dict(zip(keys, errors, strict=True)),
         "x": motion.x[-1],
         "largest_inputs": np.abs(motion.u).max(axis=0),
         "limits_exceeded": motion.passed,

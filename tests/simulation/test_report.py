@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.simulation.report import motion_report
+from fflin.simulation.report import error_sizes, motion_record, motion_report
 from tests.support.commands import run
 from tests.support.marks import exhaustive
 from tests.support.messages import says
@@ -294,3 +294,15 @@ def test_the_angle_of_a_fast_wheel_counts_all_its_turns(speed, every):
 def test_a_printed_motion_is_its_report():
     motion = fflin.simulate(fflin.load("cubesat"), duration=0.1)
     assert str(motion) == motion_report(motion) != repr(motion)
+
+
+def test_errors_of_one_title_in_two_units_are_both_in_the_record():
+    robot = fflin.load("panda")  # seven revolute joints, and a prismatic one in the gripper
+    lin = fflin.linearize(robot)
+    q0 = fflin.configuration(robot, {"panda_joint1": 0.1, "panda_finger_joint1": 0.01})
+    law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    motion = fflin.simulate(robot, law, q0=q0, duration=0.1, dt=0.01)
+    errors = motion_record(motion)["errors"]
+    assert [errors[f"joints [{unit}]"].initial for unit in ("rad", "m")] == [0.1, 0.01]
+    assert errors["position"].unit == "m"
+    assert len(errors) == len(error_sizes(motion))

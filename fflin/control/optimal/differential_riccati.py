@@ -70,7 +70,8 @@ def transitions(early: Array, late: Array, h: Array) -> Array:
 def _constant(coefficients: Array, h: Array) -> Array:
     """Return the transitions over times h (k,) for constant coefficients.
 
-    The matrix exponential gives the transitions over short times, which are then doubled.
+    A matrix exponential gives the transitions over a fraction of h. The fraction is then doubled
+    until it is 1.
     """
     A, S, Q = coefficients
     n, (a, s, q) = A.shape[-1], np.abs(coefficients).max(axis=1)

@@ -32,7 +32,7 @@ _NEARLY = 1e-3
 _SEEKS, _FLIES = 1e-6, 1e-8
 
 # The search ends after _MOST iterations. It ends earlier if an iteration adds no limit within the
-# intervals, and if the predicted reduction of the merit function is at most _SAVED times its value.
+# intervals and the predicted reduction of the merit function is at most _SAVED times its value.
 # The gaps are closed in at most _MOST_CLOSING iterations. At most _MOST_HALVINGS lengths of a step
 # are tried.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10

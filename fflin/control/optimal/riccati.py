@@ -76,8 +76,8 @@ class Riccati:
         N = None if N is None or not N.any() else N
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # For a sampled system, A - I is used, because A' P A - P would lose accuracy by
-        # cancellation.
+        # For a sampled system, the equation is written in A - I, because A' P A - P would lose
+        # accuracy by cancellation.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -193,7 +193,10 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation (10.6) with the same P; None if its R is not definite."""
+    """Return the continuous equation (10.6) with the same P.
+
+    Return None if R of this equation is not positive definite.
+    """
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))

@@ -16,8 +16,8 @@ from fflin.robot.robot import Robot
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
 
 # Least number of steps per interval in a trial. Limits also apply within an interval, at the ends
-# of up to this many equal parts, which must be ends of steps. All numbers of steps and parts are
-# powers of 2.
+# of up to this many equal parts. A part must end where a step ends, so all numbers of steps and of
+# parts are powers of 2.
 _STEPS = 16
 
 # Jacobians are integrated with a quarter of the steps of the motion, but with at most this number
