@@ -165,7 +165,7 @@ class Chart:
         return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Convert derivatives (.., k, 3) with respect to d theta to ones with respect to q_b.
+        """Convert derivatives (.., k, 3) from d theta to q_b as the independent variable.
 
         d theta is a small rotation of the base in base axes (1.3).
         """

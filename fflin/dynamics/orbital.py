@@ -225,7 +225,7 @@ class GravityGradient(NamedTuple):
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
-        """Return the field at the base pose of a configuration (nq,), after `require_near`."""
+        """Return the field at the base pose of a configuration (nq,); `require_near` checks it."""
         field.require_near(q)
         R, position = field.base(q)
         n = mean_motion(field.robot)

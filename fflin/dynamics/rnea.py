@@ -181,7 +181,8 @@ class AccelerationDerivatives(NamedTuple):
     """
 
     c: Array  # (.., 6 + n): without gravity and omega_b x v_b, see (3.2)
-    # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state in base axes.
+    # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state. Both are in
+    # base axes.
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
     gravity: Array  # (.., 3) in base axes
