@@ -26,7 +26,7 @@ class Integrator:
 
     # A step of length h starts at q and v. The accelerations at its stages are l1, l2, and so on.
 
-    # Times of the stages if h = 1.
+    # Times of the stages after the start of a step, divided by h.
     nodes: ClassVar[tuple[float, ...]]
     # Weights of l1, l2, ... in the integral of the acceleration: the step changes v by h times the
     # weighted sum.

@@ -50,8 +50,8 @@ class Point(NamedTuple):
     r_b: Array  # position (3,) of the base relative to the reference
     v_b: Array  # velocity (3,) of the base's origin in base axes
     g: Array  # gravity (3,) in base axes
-    # For each wheel that is modelled without a joint of its own: the joint on which the wheel is
-    # mounted, and the angular momentum (3,) of the wheel in the axes of this joint.
+    # (joint, momentum) for each wheel that is modelled without a joint of its own. The wheel is
+    # mounted on this joint, and its angular momentum (3,) is in the axes of the joint.
     stored: tuple[tuple[int, Array], ...]
     spin: Array  # (3,) angular velocity of the orbit frame in base axes
 

@@ -433,9 +433,9 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques in state order, so that B_u is the
         # identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
-        # One item for each joint on which thrusters, or wheels without a joint of their own, are
-        # mounted: (joint, indices of these k inputs, wrenches (6, k) of unit inputs in the frame of
-        # the joint).
+        # (joint, indices, wrenches) for each joint on which thrusters, or wheels without a joint of
+        # their own, are mounted. The indices are of these k inputs, and the wrenches (6, k) of unit
+        # inputs are in the frame of the joint.
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
         self._of_carried: list[int] = []
         for joint, items in carried.items():

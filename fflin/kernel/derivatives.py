@@ -264,7 +264,7 @@ class RowAccelerations:
         """Write the derivatives of the accelerations c; return c (N, 6 + n) and the mask.
 
         The derivatives with respect to displacements of the state are written to the lower half of
-        each matrix in A (N, nx, nx), and D_u is written to `by_u`. A and `by_u` are C-contiguous.
+        each matrix in A (N, nx, nx). D_u is written to `by_u`. A and `by_u` are C-contiguous, and
         nu and u are in base axes.
         """
         force = u @ self._actuation.fixed.T

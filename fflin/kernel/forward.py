@@ -250,8 +250,8 @@ def _momentum_error(work, robot, nu, momentum):
     Both are (angular, linear) in base axes, about the base's origin.
     """
     tree = robot.tree
-    # The momentum of the bodies is the base rows of M nu. M is symmetric, so the entries of these
-    # rows for a joint are the first six entries of the joint's row in the packed M.
+    # The six base rows of M times nu are the momentum of the bodies. By symmetry, the column of a
+    # joint in these rows contains the first six entries of the joint's row in the packed M.
     error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
     for index in range(6, len(tree.row)):
         row = vec.get6(work, tree.packed + tree.row[index])
