@@ -42,10 +42,10 @@ _IDLE = 1e-12
 # because the bandwidth depends on the inertia M + B / w, which depends on the bandwidth w.
 _PASSES = 4
 
-# Largest number of bandwidths that `_slowed` tries. For each of them, it estimates the factor
-# `left` on the bandwidth at which the first effort reaches its limit. If `left` is below 1 for
-# every bandwidth, `_slowed` chooses the highest bandwidth whose `left` is at least _IN_VAIN times
-# the largest `left`. A lower bandwidth would hardly reduce the efforts.
+# Largest number of bandwidths that `_slowed` tries. For each bandwidth, it estimates the factor
+# `left`: at `left` times the bandwidth, the first effort reaches its limit. If `left` is below 1
+# for every bandwidth, `_slowed` chooses the highest bandwidth whose `left` is at least _IN_VAIN
+# times the largest `left`. A lower bandwidth would hardly reduce the efforts.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # The report names a mode if its decay rate is below this fraction of the nominal decay rate, which
@@ -334,8 +334,8 @@ def _slowed(
     no input acts, because only springs or gravity can return such coordinates. The results are the
     bandwidth and a description of the loop.
     """
-    # A trial contains the bandwidth factor at which the first effort reaches its limit, the name of
-    # this effort, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
+    # A trial contains the factor `left` (see `_TRIALS`), the name of the first effort that reaches
+    # its limit, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
     # inputs.
     trials = list[tuple[float, str, Limit, str, Array]]()
     for _ in range(_TRIALS):

@@ -190,7 +190,7 @@ class _Made(NamedTuple):
     u: Array
     missed: Array  # error at the goal (nx,)
     at_knots: Array  # largest limit violations at the knots (nx,)
-    beyond: Array  # limit violations at the ends of all parts (N, parts, nx), relative to limits
+    beyond: Array  # limit violations (N, parts, nx) at the ends of all parts, relative to limits
     most: float  # largest entry of `beyond`
 
     @property

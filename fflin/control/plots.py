@@ -21,8 +21,8 @@ _LINE = "#888888"
 
 _POINTS = 400
 
-# Vertical offset of the points of each test. Without it, the points of two independent computations
-# would overlap.
+# Vertical offset of the plotted points of each test. Without it, the points of two independent
+# computations would overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 # A gain factor below this counts as zero. Such factors occur because the loop gain of an integrator

@@ -316,7 +316,7 @@ class Loop:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Set z at the next stage to a weighted sum of dz/dt and of z at the start of the step."""
+        """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:

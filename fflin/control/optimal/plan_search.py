@@ -14,9 +14,10 @@ from fflin.control.optimal.shooting import Point, Shooting
 # this.
 _ENDS = 1e-8
 
-# If an iterate exceeds the limit of a state at a point within an interval by more than _LIMITED
-# times the limit, the limit applies at this point and its neighbours from then on. At such points,
-# the limit is tightened by the fraction _TIGHTER, because the motion may exceed it between points.
+# Within the intervals, a limit applies only where it is needed. If an iterate exceeds the limit at
+# a point there by more than _LIMITED times the limit, the limit applies at this point and its
+# neighbours from then on. It is tightened by the fraction _TIGHTER, because the motion may exceed
+# it between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
 # If no gap between intervals exceeds this, the gaps count as closed, and the plan is integrated as
