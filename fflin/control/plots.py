@@ -304,7 +304,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the gains of loop i at the frequencies where `value` of the gain changes sign."""
+        """Return the gains of loop i at the frequencies where ``value(gain)`` changes sign."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))
