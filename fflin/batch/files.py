@@ -8,6 +8,7 @@ arrays, and all strings except ``request``.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -235,7 +236,11 @@ class FileStore:
         with self._reported():
             if not self.resumed:
                 size = 8 * count * sum(map(math.prod, shapes.values()))
-                _reserve(self.part, size + _OVERHEAD)
+                try:
+                    _reserve(self.part, size + _OVERHEAD)
+                except BaseException:
+                    self.part.unlink(missing_ok=True)
+                    raise
             self._file = hdf5().File(self.part, "r+" if self.resumed else "w", libver=CHECKED)
         try:
             with self._reported():
@@ -276,6 +281,8 @@ class FileStore:
             raise
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             hint = "; if no other run uses it, remove it to start again" * self.resumed
+            if self.resumed and getattr(error, "errno", None) == errno.ENOSPC:
+                hint = "; free disk space, and make the same call again"
             raise FileError(
                 f"{self.part}: cannot be read or written: {writing.reason(error)}{hint}"
             ) from None
@@ -329,17 +336,13 @@ class FileStore:
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Reserve `size` bytes of disk space for a file; if this fails, delete the file.
+    """Reserve `size` bytes of disk space for a file.
 
     The space is reserved because HDF5 can crash the process if the disk is full.
     """
-    try:
-        with path.open("ab") as file:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+    with path.open("ab") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _memory() -> float:

@@ -105,7 +105,7 @@ class PointProperties(NamedTuple):
 
 def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
     """Return the mass properties, the wheel momentum and the thruster authority at q and v."""
-    # If the base has its neutral pose, base axes are equal to world axes.
+    # The base gets its neutral pose, in which base axes are equal to world axes.
     data, q = robot.create_data(), np.concatenate((robot.neutral()[:7], q[7:]))
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center, inertia = data.com[0].copy(), np.array(data.Ig.inertia)
@@ -152,10 +152,10 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
 
 
 def gives_every_wrench(W: Array, pushing: Mask) -> bool:
-    """Return whether inputs can produce every wrench.
+    """Return whether the inputs can produce every wrench.
 
-    The columns of W (6, k) are the wrenches of unit inputs. `pushing` (k,) is True for inputs that
-    cannot be negative.
+    Column i of W (6, k) is the wrench of a unit value of input i. `pushing` (k,) is True for inputs
+    that cannot be negative.
     """
     from scipy.optimize import nnls
 

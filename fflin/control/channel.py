@@ -117,8 +117,8 @@ class Law:
     policy: Callable[[float, Array, Array], object]
     names: tuple[str, ...]
     limits: tuple[Array, Array]
-    # If the squared norm of v exceeds this, the motion counts as diverging. A command that is not
-    # finite then raises no error.
+    # If the squared norm of v is at least this, the motion counts as diverging. In a diverging
+    # motion, a command that is not finite raises no error.
     slow: float
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -167,7 +167,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 def channelled(
     law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
 ) -> Inputs:
-    """Return a channel as a function f(step, *point) that returns the inputs (nu,) of a step.
+    """Return a function f(step, *point) that computes the inputs (nu,) of a step with a channel.
 
     f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds (k,) of the
     wheels whose speed is limited.

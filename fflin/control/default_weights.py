@@ -26,25 +26,26 @@ ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
 # If a mode is unstable, the bandwidth is at least _OF_GROWTH times the growth rate of the mode.
 # Effort limits may reduce the bandwidth to _LEAST_OF_GROWTH times this rate. With a lower
-# bandwidth, joints with a small inertia would swing by radians.
+# bandwidth, joints with a small inertia would swing by several radians.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# The weight on velocities (10.8) assumes that the effect S R^-1 S' of the inputs is, in every
-# direction, at least this fraction of D (10.7). A mode with a smaller effect keeps its open-loop
-# decay.
+# In the weight on velocities (10.8), the effect S R^-1 S' of the inputs is replaced by this
+# fraction of D (10.7) in every direction in which it is smaller. A mode on which the inputs have a
+# smaller effect keeps its open-loop decay.
 _LEAST_REACH = 1e-3
 
-# The inputs count as having no effect on a coordinate if the diagonal entry of S R^-1 S' for the
-# coordinate is at most this times the entry of D (10.7).
+# The inputs count as having no effect on coordinate i if the diagonal entry i of S R^-1 S' is at
+# most this times D_i (10.7).
 _IDLE = 1e-12
 
 # Largest number of iterations for the bandwidth of a robot with dampers. Iterations are needed,
 # because the bandwidth depends on the inertia M + B / w, which depends on the bandwidth w.
 _PASSES = 4
 
-# Largest number of bandwidths that `_slowed` tries. The effort limits permit about `left` times
-# each bandwidth. If they permit none of the bandwidths, `_slowed` chooses the highest one whose
-# `left` is at least _IN_VAIN times the largest `left`. A lower one would hardly reduce the efforts.
+# Largest number of bandwidths that `_slowed` tries. For each bandwidth, it estimates the factor
+# `left`: at `left` times the bandwidth, the first effort reaches its limit. If `left` is below 1
+# for every bandwidth, `_slowed` chooses the highest bandwidth whose `left` is at least _IN_VAIN
+# times the largest `left`. A lower bandwidth would hardly reduce the efforts.
 _TRIALS, _IN_VAIN = 8, 0.9
 
 # The report names a mode if its decay rate is below this fraction of the nominal decay rate, which
@@ -54,9 +55,10 @@ _AS_SLOW = 0.9
 _NOT_ENOUGH = "is too small for all displacements"
 
 
-# Weights Q (nx, nx) and R (nu, nu), a description of their rule, the bandwidth of the loop, and the
-# costs (nx + nu,): the contribution of each state and input to the cost at its largest value. The
-# rate of a coordinate has the cost of the coordinate.
+# Weights Q (nx, nx) and R (nu, nu), a description of their rule, the bandwidth of the loop [rad/s],
+# and the costs (nx + nu,). Each cost is the contribution of a state or input to the cost function
+# at the largest value of this state or input. The rate of a coordinate has the cost of the
+# coordinate.
 Weights: TypeAlias = tuple[Array, Array, str, float, Array]
 
 
@@ -77,7 +79,7 @@ class Limit(NamedTuple):
 
 
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
-    """Return weights with which a displaced robot returns without exceeding its limits (10.7).
+    """Return the weights (10.7), with which a displaced robot moves back within its limits.
 
     `momenta` maps the name of each wheel speed to the largest momentum [N m s] that the inputs may
     add to the wheel.
@@ -105,8 +107,9 @@ def _damping(lin: LinearModel) -> Array:
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # The damping rates of gyroscopic coupling and of orbital motion sum to zero, because neither
-    # dissipates energy. If the rates of a model sum to zero, the model counts as undamped.
+    # Gyroscopic coupling and orbital motion may add damping rates of both signs. These rates sum to
+    # zero, because conservative motion preserves volumes in phase space. If the rates of a model
+    # sum to zero, the model counts as undamped.
     size = np.sqrt(lin.M.diagonal())
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
@@ -131,8 +134,8 @@ def _of_inertia(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
             "it, or give Q and R"
         )
-    # Effect S R^-1 S' of the inputs on the coordinates. It is made positive definite, because the
-    # weights contain roots of its eigenvalues.
+    # Effect S R^-1 S' of the inputs on the coordinates. This matrix is made positive definite,
+    # because its inverse is needed for the gain.
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
@@ -150,7 +153,8 @@ def _of_inertia(
     gain = (S / cost).T @ np.linalg.solve(reach, back.T @ (ratios[:, None] ** 0.75 * to_modes))
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
-    # `room` contains the limits on the rates of the coordinates, and on momenta added to wheels.
+    # `room` contains the limits on the rates of the coordinates, and on the momenta that the inputs
+    # add to wheels.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {**momenta}
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
@@ -236,10 +240,11 @@ def _fastest(
 ) -> Array:
     """Return the largest speeds (k,) during the return from displacements `size` (m,).
 
-    The bandwidth is 1 rad/s. T (k, m) maps the rates of the modes to the speeds.
+    The speeds are computed for a bandwidth of 1 rad/s. T (k, m) maps the rates of the modes to the
+    speeds.
     """
-    # Each mode x obeys ``mass x'' + most x' + rates^2 x = 0``. Without dampers, `mass` (m,) is 1.
-    # With dampers, it is smaller.
+    # Each mode x obeys ``mass x'' + most x' + rates^2 x = 0``. The modes are normalised with
+    # M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
@@ -274,8 +279,8 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     """Return the largest magnitude of each entry of ``K d``, over all displacements d.
 
-    The magnitudes of d are `size` (m,). The rotation and the offset of the base may have any
-    direction, and the displacement of each joint any sign.
+    The displacements d have the magnitudes `size` (m,). The rotation and the offset of the base may
+    have any direction, and the displacement of each joint may have either sign.
     """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
@@ -325,12 +330,12 @@ def _slowed(
 
     The bandwidth starts at `limit` and is not reduced below `least`. The efforts at the start of
     the return are computed for displacements `size` (m,). The efforts during the return are
-    computed for displacements `driven` (m,). These are zero for coordinates on which no input acts,
-    because only springs or gravity can return such coordinates. The results are the bandwidth and a
-    description of the loop.
+    computed for displacements `driven` (m,). Entries of `driven` are zero for coordinates on which
+    no input acts, because only springs or gravity can return such coordinates. The results are the
+    bandwidth and a description of the loop.
     """
-    # A trial contains the bandwidth factor at which the first effort reaches its limit, the name of
-    # this effort, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
+    # A trial contains the factor `left` (see `_TRIALS`), the name of the first effort that reaches
+    # its limit, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
     # inputs.
     trials = list[tuple[float, str, Limit, str, Array]]()
     for _ in range(_TRIALS):
@@ -387,10 +392,10 @@ def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
 
 
-# Along a trajectory, the design displacements are multiplied by _BESIDE. The bandwidth is
-# _CONSTANTS / duration, so that the displacements decay within the duration, but at least BANDWIDTH
-# and at most _FASTEST [rad/s]. If the inputs are held, _HELD_ALONG replaces the stricter _HELD,
-# because the sampled regulator includes the hold exactly.
+# Along a trajectory, the design displacements are multiplied by _BESIDE. They should decay within
+# the duration. Therefore the bandwidth is _CONSTANTS / duration, but at least BANDWIDTH and at most
+# _FASTEST [rad/s]. If the inputs are held, _HELD_ALONG replaces the stricter _HELD, because the
+# design of the sampled regulator includes the hold exactly.
 _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from fflin.linear.exchange import ToolGain
     from fflin.robot.robot import Robot
 
-# The report omits a gain with more entries than this. The number is the size of K for a robot with
-# 3 joints and one input for each degree of freedom.
+# The report omits a gain with more entries than this, which is the number of entries of K for a
+# robot with 3 joints and one input for each degree of freedom.
 _LARGE = 9 * 18
 
 # Relative accuracy of the largest gain over frequency.
@@ -243,7 +243,8 @@ def make_gain(
 ) -> Gain:
     """Return the gain of `lin` from the Riccati solution of `part`.
 
-    `part` is `lin` or a model with some of its states. The gain of the other states is zero.
+    `part` is `lin`, or a model with only some of the states of `lin`. The gain of the other states
+    is zero.
     """
     S = selection(part.state_names, lin.state_names)
     return Gain._of(
@@ -261,7 +262,7 @@ def make_gain(
 
 
 def cautions(gain: Gain) -> list[str]:
-    """Return warnings of a small disk margin at the inputs, and of negative thrust."""
+    """Return warnings about a small disk margin at the inputs, and about negative thrust."""
     said, margins = list[str](), gain.margins
     if margins.disk < _FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
@@ -344,7 +345,7 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
 
 def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
-    """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and a mask of imaginary ones.
+    """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and a mask of the imaginary ones.
 
     At the frequency of each imaginary eigenvalue, a singular value of the frequency response equals
     `bound`. The mask may also mark an eigenvalue that is only nearly imaginary. A caller then

@@ -359,7 +359,7 @@ def _read(path: Path) -> System:
 def _indices(
     kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
 ) -> list[int]:
-    """Return the index of the model's signal that corresponds to each signal of a controller."""
+    """Return, for each signal of a controller, the index of the same signal in the model."""
     named = not all(map(_NUMBERED.fullmatch, names))
     if size != len(names if named else known):
         raise InputError(

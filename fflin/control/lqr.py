@@ -267,8 +267,8 @@ def require_fixed_point(lin: LinearModel) -> None:
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift
-    # Sizes are rounded, because their last digits differ between processors. Entries of equal size
-    # then stay in order.
+    # The message lists the largest rates first. Their magnitudes are rounded, because the last
+    # digits differ between processors and would change the order of equal rates.
     sizes = [float(f"{size:.5g}") for size in np.abs(rate).tolist()]
     shown = [
         f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"

@@ -30,17 +30,19 @@ from fflin.robot.robot import Robot
 # Weights Q, R and Qf, and the rule that gives Q and R if they are None.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
-# Largest number of entries of the matrices that map inputs to states and limits. They fill 160 MB.
+# Largest number of entries of the matrices that map inputs to states and limits. Matrices with this
+# number of entries fill 160 MB.
 _MOST_ENTRIES = 20_000_000
 
-# Settings of the solver DAQP. The rows of the constraints are scaled to length 1. _EXACT is the
-# tolerance and _PRICE the weight of soft-limit violations, both relative to the median width of the
-# limits. _YIELDS is the regularisation of soft limits. If a plan exceeds a soft limit by less than
-# _VIOLATED times this width, the violation is not reported.
+# Settings of the solver DAQP. The rows of the constraints are scaled to length 1. The width of a
+# limit is its upper bound minus its lower bound. _EXACT is the tolerance of the constraints, and
+# _PRICE is the weight of soft-limit violations, both relative to the median width. _YIELDS is the
+# regularisation of soft limits. If a plan exceeds a soft limit by less than _VIOLATED times the
+# median width, the violation is not reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# If the robot exceeds a limit by less than this fraction of the width between the lower and the
-# upper limit, the violation is not reported.
+# If the robot exceeds a limit by less than this fraction of the difference between the upper and
+# the lower limit, the violation is not reported.
 _OVER = 1e-3
 
 # The two kinds of soft-limit violations in the notes of a run.
@@ -345,11 +347,12 @@ class Matrices(NamedTuple):
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return three arrays, which predict the errors, z and the limited values over N stages.
+    """Return the arrays that predict the errors, z and the limited values over N stages.
 
     z is the scaled difference between the inputs d and the inputs -K e of the regulator, so that
-    ``d = L z - K e``. Each array has N nu + nx columns. The first N nu columns multiply z if
-    `planned` is True, and d otherwise. The last nx columns multiply the initial error.
+    ``d = L z - K e``. Each of the three arrays has N nu + nx columns. The first N nu columns
+    multiply z if `planned` is True, and d otherwise. The last nx columns multiply the initial
+    error.
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
@@ -492,8 +495,8 @@ class Receding:
     def _record(self, what: str, t: float, excess: Array, unit: Array, least: float) -> None:
         """Count a plan or sample that violates a soft limit, and record the largest violation.
 
-        A soft limit is violated if the product of `excess` and `unit` is larger than `least`. The
-        first entries of `excess` belong to the sample that starts at time t [s].
+        A soft limit is violated if its entry of ``excess * unit`` is larger than `least`. The
+        entries are ordered by sample, and the first sample starts at time t [s].
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
         row, (count, most, said) = int(fractions.argmax()), self._violations[what]

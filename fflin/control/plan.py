@@ -190,7 +190,7 @@ class _Made(NamedTuple):
     u: Array
     missed: Array  # error at the goal (nx,)
     at_knots: Array  # largest limit violations at the knots (nx,)
-    beyond: Array  # limit violations at the ends of all parts (N, parts, nx), relative to limits
+    beyond: Array  # limit violations (N, parts, nx) at the ends of all parts, relative to limits
     most: float  # largest entry of `beyond`
 
     @property
@@ -200,9 +200,10 @@ class _Made(NamedTuple):
 
 
 def _least(search: Search) -> _Made:
-    """Search for a plan of least effort, and return the attempt with the smallest violation.
+    """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
-    An attempt that reaches the goal has priority over an attempt that does not.
+    An attempt that reaches the goal is better than an attempt that does not. If both or neither
+    reach the goal, the attempt with the smaller violation is better.
     """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)

@@ -21,8 +21,8 @@ _LINE = "#888888"
 
 _POINTS = 400
 
-# Vertical offset of the points of each test. Without it, the points of two independent computations
-# would overlap.
+# Vertical offset of the plotted points of each test. Without it, the points of two independent
+# computations would overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 # A gain factor below this counts as zero. Such factors occur because the loop gain of an integrator
@@ -304,7 +304,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the gains of loop i at the frequencies where `value` of the gain changes sign."""
+        """Return the gains of loop i at the frequencies where ``value(gain)`` changes sign."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))

@@ -164,7 +164,7 @@ class Allocation:
 
 
 class AllocatedPolicy:
-    """Policy of an `Allocation` for one robot, with `advance` and `notes` of the inner policy."""
+    """Policy that realises the commands of an `Allocation` with the inputs of a robot."""
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = axes_of(allocation)
@@ -216,8 +216,9 @@ def next_sample(t: float, last: float, dt: float) -> float:
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
     """Return the index of each measured value, and the list of gyroscopes.
 
-    A measured value is a state, with the index of the state, or a rate of a gyroscope. The indices
-    of gyroscope rates follow the indices of the states. Other sensors raise `InputError`.
+    Each measured value is a state or a rate of a gyroscope. The index of a state is its index in
+    the state vector, and the indices of the gyroscope rates follow. Other sensors raise
+    `InputError`.
     """
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
@@ -238,8 +239,8 @@ Measure: TypeAlias = Callable[[Array], Array]
 # Function of a controller's state z that returns the command, and the next z or dz/dt.
 Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
 
-# Function of time that returns a compensator's step, a function that measures the robot's outputs,
-# and the state near which angles are unwrapped.
+# Function of time that returns three values: the step function of a compensator, a function that
+# measures the robot's outputs, and the state near which angles are unwrapped.
 At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
 
 
@@ -271,7 +272,7 @@ class Loop:
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
     The compensator's state z advances at each sample, or at each stage of the integrator if dt is
-    0. `sizes` are the sizes of z and y.
+    0. `sizes` contains the lengths of z and of the measured outputs y.
     """
 
     def __init__(
@@ -315,7 +316,7 @@ class Loop:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Set z at the next stage to a weighted sum of z at the start of the step and the rates."""
+        """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages."""
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:

@@ -175,7 +175,7 @@ class TrajectoryFeedback(Feedback):
         return state
 
     def deviation(self, robot: Robot) -> Deviation:
-        """Return f(t, q, v) -> u*, e: the inputs of the trajectory, and the error from it."""
+        """Return f(t, q, v) -> u*, e: the inputs of the trajectory and the error relative to it."""
         state = self.state_map(robot)
 
         def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:

@@ -52,7 +52,7 @@ class Schedule(ModelDesign):
         return starts
 
     def interval(self, t: float) -> int:
-        """Return the index of the interval or sample at t; raise `InputError` if t is outside."""
+        """Return the index of the interval or sample at t; if there is none, raise `InputError`."""
         t, first, last = number("t", t), self.starts[0], float(self.t[-1])
         if not first <= t <= last:
             raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
@@ -407,7 +407,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model about rest at knot `end`, in base axes. The rotors keep their speeds."""
+    """Return the model at rest at knot `end`, in base axes. Only rotors keep their speeds."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = robot.rotors
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]

@@ -255,9 +255,9 @@ def rule_weights(
 
     Weights in `given` replace the weights of the rule.
     """
-    # If the continuous model of a sampled model is known, the rule gives a continuous cost. This
-    # cost is converted to a sampled cost with held inputs. By default, the robot's `weights` name
-    # the rule. If the robot names no rule, the rule is "urdf".
+    # If a sampled model has a known continuous model, the rule gives a cost for the continuous
+    # model, which is converted to a sampled cost with held inputs. By default, the robot's
+    # `weights` name the rule. If the robot names no rule, the rule is "urdf".
     source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
     own = lin.weights if given.get("rule") is None else {}
@@ -271,9 +271,10 @@ def rule_weights(
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
     if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
-        # A common factor of Q and R does not change the gain. By Bryson's rule, a signal costs 1 at
-        # the largest value that the user gave for it. The rule's weights are scaled likewise: at
-        # the rule's largest values, the geometric mean of the costs of these signals is 1.
+        # By Bryson's rule, each signal with a largest value from the user costs 1 at this value.
+        # To match this scale, Q and R of the rule are multiplied by a common factor, which does not
+        # change the gain of the rule. With this factor, the geometric mean of the costs of the same
+        # signals is 1 at the largest values of the rule.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
         scale = math.exp(-np.log(costs).mean()) if costs else 1.0
         Q, R = scale * Q, scale * R
@@ -317,8 +318,9 @@ def _of_regulated(
     terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # The inputs that exert no force on the robot without its wheels form a null space. Inputs
-        # with coordinates n in this null space accelerate the wheels by X n.
+        # Some inputs accelerate the wheels, but exert no force on the robot without its wheels.
+        # They form a null space. Inputs with coordinates n in this space accelerate the wheels by
+        # X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S

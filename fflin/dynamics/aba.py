@@ -151,10 +151,10 @@ class Aba:
     ) -> tuple[Array, Array, Array]:
         """Return the derivatives of dnu/dt with respect to q, v and force, for mimic joints."""
         # The accelerations satisfy S^T M S nudot = S^T (tau - b), without the constraint forces of
-        # mimic joints. ABA needs a regular M, but M is singular if a mimic joint or its leader
-        # moves no mass. So each mimic joint and each leader gets a rotor. The inertia of the rotor
-        # is the diagonal entry of S^T M S for the coordinate of the leader. The contribution of the
-        # rotors to S^T M S is subtracted afterwards.
+        # mimic joints. ABA requires an invertible M, but M is singular if a mimic joint or its
+        # leader moves no mass. Therefore each mimic joint and each leader gets a rotor. The inertia
+        # of the rotor is the diagonal entry of S^T M S for the coordinate of the leader. The
+        # contribution of the rotors to S^T M S is subtracted afterwards.
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

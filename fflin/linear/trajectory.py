@@ -41,17 +41,19 @@ _CAUSES = (
     "or springs, damping or gravity that differ from the robot"
 )
 
-# The integration over an interval is repeated with halved steps, until the state at the end changes
-# by at most _ACCURACY, or until the interval has _MOST_STEPS steps. The change is divided by the
-# duration of the interval and by the largest rates.
+# The integration over an interval is repeated with halved steps, until the state at the end of the
+# interval changes by at most _ACCURACY, or until the interval has _MOST_STEPS steps. The change of
+# the state is relative: it is divided by the duration of the interval and by the largest velocities
+# and accelerations of the motion.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
 # Rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest position.
-# _SUM_ROUNDING is the error of an acceleration, relative to the terms whose sum it is.
+# An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to the sum of
+# the magnitudes of the terms.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# A time counts as a knot if its distance from the knot is less than this fraction of the interval.
+# A time counts as the time of a knot if the two differ by less than this fraction of the interval.
 _NEAR = 1e-9
 
 
@@ -157,7 +159,7 @@ class Trajectory(Design):
         )
 
     def _report(self) -> str:
-        """Return text about the trajectory, with its largest residual or its `_fault`."""
+        """Return text about the trajectory: its largest residual, or why it is invalid."""
         said = self._fault or f"residual {self.residual.max():.1e}"
         return folded([repr(self), said, *self._note.splitlines()])
 
@@ -214,9 +216,9 @@ class Trajectory(Design):
         return q, v, self._in_base_axes(q, self._input(k, s))
 
     def _input(self, k: int | Indices, fraction: float | Array) -> Array:
-        """Return the inputs, in the axes of `frame`, within the intervals k.
+        """Return the inputs at one time in each of the intervals k, in the axes of `frame`.
 
-        `fraction` is the part of each interval that has elapsed, from 0 to 1.
+        The time is given by `fraction`, the elapsed fraction of each interval, from 0 to 1.
         """
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
@@ -262,7 +264,8 @@ class Trajectory(Design):
     def _fault(self) -> str:
         """Return the reason why the trajectory is invalid, or an empty text.
 
-        Either the knots are not a motion of the robot, or the base rotates too far in one interval.
+        A trajectory is invalid if the knots are not a motion of the robot, or if the base rotates
+        too far in one interval.
         """
         missed = self.interval_errors
         k = int(missed.argmax())
@@ -355,10 +358,10 @@ class Trajectory(Design):
         The error is infinite if the integration overflows.
         """
         # Errors are divided by the largest velocities and accelerations of the motion. A high
-        # orbital velocity of the base would hide errors. Therefore subtract the median velocity of
-        # the base, which does not change the accelerations (Galilean invariance). A fast wheel
-        # would hide the errors of joints with the same divisor. Therefore each rotor has its own
-        # divisor.
+        # orbital velocity of the base would make this divisor so large that it hides errors.
+        # Therefore, subtract the median velocity of the base. By Galilean invariance, this does not
+        # change the accelerations. A fast wheel would hide the errors of slower joints if they had
+        # the same divisor. Therefore, each rotor has its own divisor.
         t, u, state = self.t, self.u, self._aba.state
         rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -387,8 +390,8 @@ class Trajectory(Design):
             return float(np.maximum(miss, jump).max())
 
         found, steps, model = [], 1, self.robot.model
-        # If the knots are not a motion of the robot, the integration may overflow. NumPy need not
-        # warn, because an overflow makes the error of the interval infinite.
+        # If the knots are not a motion of the robot, the integration may overflow. The error of the
+        # interval is infinite in this case, so suppress NumPy's warnings about the overflow.
         with np.errstate(all="ignore"):
             for k, h in enumerate(np.diff(t).tolist()):
                 steps = max(1, steps // 4)
@@ -482,7 +485,8 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
 def along(motion: Motion, robot: Robot | None) -> Trajectory:
     """Convert a motion to a trajectory with constant or linear inputs between the knots.
 
-    If the inputs vary, both trajectories are computed. The result is the trajectory whose largest
+    If the inputs of the motion vary, two trajectories are computed: one with constant inputs
+    between the knots, and one with linear inputs. The result is the trajectory whose largest
     residual is smaller.
     """
     if motion.phases:

@@ -2,5 +2,5 @@
 
 A robot is a free-flying tree of links and joints with inputs, outputs and springs. Joints can be
 locked. The package also contains the catalogue of robot names, and `robot.urdf`, which reads URDF
-files. The package imports `base`.
+files. Within fflin, the package imports only `base`.
 """

@@ -70,7 +70,7 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find a robot by its name, or by the path of its file, which is relative to `folder`.
+    """Find a robot by its name, or by the path of its file; a relative path starts at `folder`.
 
     Bundled names take precedence over paths, and paths over names in example-robot-data.
     """
@@ -104,7 +104,7 @@ def find_inputs(inputs: str | Path) -> Path:
 
 
 def folders(given: object, within: str | Path = "") -> tuple[Path, ...]:
-    """Return the paths of one or several given folders; relative paths begin at `within`."""
+    """Return the paths of one or several folders; relative paths start at the folder `within`."""
     listed = [given] if isinstance(given, str | os.PathLike) else given
     if not isinstance(listed, Sequence):
         raise InputError(f"package_dirs is {given!r}, expected a list of folders")

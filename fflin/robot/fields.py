@@ -151,7 +151,7 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
 
 
 def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
-    """Return the joints without a motor in state order; `value` contains names or patterns."""
+    """Return the names of the passive joints in state order; `value` has names or patterns."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
@@ -245,8 +245,8 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
     The magnitude of limits (least, largest) is
 
-    - the range largest - least for a joint position, or if least is not negative;
-    - otherwise the smaller of -least and largest.
+    - for a joint position, or if least is not negative: the range largest - least;
+    - otherwise: the smaller of -least and largest.
     """
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
@@ -258,8 +258,8 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
     """Return the limits that the argument `limits` selects.
 
-    The text "urdf" in `limits` selects all limits of the robot. Any other entry of `limits` is
-    selected, and replaces the limit of the robot.
+    The text "urdf" in `limits` selects all limits of the robot. Every other entry of `limits` is
+    itself a limit. It replaces the robot's limit of the same input or state.
     """
     own, given = dict[str, Range](), dict[str, Range]()
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)

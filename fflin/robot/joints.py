@@ -18,7 +18,7 @@ from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
-# Largest rounding error of the length of a normalised quaternion: two units in the last place of 1.
+# Largest rounding error of the length of a normalised quaternion.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # A `pin.Data` takes about 32 nv^3 bytes, because it contains four tensors with nv^3 entries each.
@@ -41,8 +41,8 @@ class Joint(NamedTuple):
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
     # Generalised inertia of a mode while its link is fixed in space; 1 for a modal amplitude.
     inertia: float = 1.0
-    # Bound on the rotation [rad] of the appendage or slosh mass per unit of the mode's coordinate;
-    # 0 if the mode only translates.
+    # Largest rotation [rad] of the appendage or slosh mass per unit of the mode's coordinate; 0 if
+    # the mode only translates.
     rotation: float = 0.0
 
     @property
@@ -154,8 +154,8 @@ class Coordinates:
     followers: tuple[Follower, ...] = ()
     # Names of wheels and modes that no longer exist, because inputs or appendages were replaced.
     _removed: tuple[str, ...] = ()
-    # The model, and a copy of it from the time when the robot was made. If the model differs from
-    # the copy, it was changed later.
+    # The model, and a copy of it from the time when the robot was made. If the two differ, the
+    # model was changed later.
     _as_made: tuple[pin.Model, pin.Model] | None = None
 
     @cached_property
@@ -227,7 +227,7 @@ class Coordinates:
         return v
 
     def _sized(self, name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-        """Return a vector (size,); if `value` is too long, the error names removed coordinates."""
+        """Return a vector (size,); the error for a longer vector names removed wheels and modes."""
         if self._removed and np.size(value) > size:
             gone = ", ".join(self._removed)
             of_what += (
@@ -281,9 +281,9 @@ def require_room(model: pin.Model, name: str) -> None:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Return the name of a part of `model` that differs from `made`, or an empty text.
+    """Return text that names a difference between `model` and `made`, or an empty text.
 
-    Only parts on which A, B or C depends are compared. Changed limits and new frames are ignored.
+    Only properties that affect A, B or C are compared. Changed limits and new frames are ignored.
     """
     of_joints = {"joints": "axis", "jointPlacements": "placement", "inertias": "inertia"}
     for name in ("names", "parents", *of_joints, "armature", "frames"):

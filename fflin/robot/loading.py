@@ -33,8 +33,8 @@ from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
 
-# Fields that a robot file gives as arrays of tables, as {field: names of the arrays}. For example,
-# the tables [[input]] give the field `inputs`.
+# Fields that are arrays of tables in a robot file: {field: names of the arrays}. For example, the
+# tables [[input]] give the field `inputs`.
 _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
 # Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
@@ -210,7 +210,10 @@ def from_model(
 
 
 def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
-    """Make a robot from a model: one tree on a free-flyer, with joints in depth-first order."""
+    """Make a robot from a model of one tree on a free-flyer, with joints in depth-first order.
+
+    Raise `ModelError` for any other model.
+    """
     root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
     if root != "JointModelFreeFlyer":
         raise ModelError(
@@ -245,7 +248,7 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Raise `ModelError` if a value of a joint or body is not finite or physically impossible."""
+    """Raise `ModelError` if a value of a joint or body is infinite, NaN or unphysical."""
     for index in range(ROOT, model.njoints):
         body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
@@ -270,7 +273,7 @@ def _check_model(model: pin.Model, name: str) -> None:
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:
-    """Return a robot that is one body without joints; the mass of `payload` must be positive."""
+    """Return a robot without joints, whose only body is `payload`; the mass must be positive."""
     inertia = given_body("payload", payload, payload)
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")

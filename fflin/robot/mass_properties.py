@@ -1,4 +1,4 @@
-r"""Mass properties of links and bodies, changes of them, and motions without kinetic energy.
+r"""Mass properties of links and bodies, their changes, and motions without kinetic energy.
 
 Let a body have the mass m, the centre of mass c and the inertia I about c. With the identity matrix
 E, the second moments of its mass distribution about c are
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
-# Largest relative rounding errors: _ROUNDING of a sum of inertias, and _NO_MOMENT of a principal
-# moment of inertia or of a second moment.
+# _ROUNDING is the largest relative rounding error of a sum of inertias. _NO_MOMENT is the largest
+# relative rounding error of a principal moment of inertia, and of a second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
-# Singular values below this fraction of the largest one count as zero. Relative to the largest one,
-# rounding errors are about 1e-15. The smallest value that is not a rounding error is 1e-7, for
-# links that are 1e7 m apart.
+# Singular values below this fraction of the largest one count as zero. The fraction is above the
+# rounding errors of about 1e-15, and below the smallest nonzero value of about 1e-7, which occurs
+# for links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message about motions without kinetic energy names the coordinates that are involved. A
-# coordinate is involved if its component, in motions of unit norm, exceeds this value.
+# A message about motions without kinetic energy names the coordinates that take part in them: the
+# norm of their components in an orthonormal basis of these motions exceeds this value.
 _INVOLVED = 0.1
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
@@ -142,8 +142,9 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
     if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
         inertia = inertia[:, :1] * np.ones(3)
-    # If the affine map T is applied to the mass distribution, P becomes T P T^T, which is positive
-    # semidefinite if P is. Here, T stretches the body about its centre of mass, then shifts it.
+    # If the affine map T is applied to the mass distribution, P becomes T P T^T. This matrix is
+    # positive semidefinite if P is. Here, T stretches the body about its centre of mass, and then
+    # shifts it.
     T = np.zeros((len(com), 4, 4))
     T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
     T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever
@@ -192,10 +193,10 @@ class Piece(NamedTuple):
 def pieces_of(robot: Robot) -> dict[str, Piece]:
     """Return the links and bodies of a robot as {name: piece}.
 
-    - Each link with mass is a piece.
-    - A body is also a piece, except that a body of one link is the same piece as this link.
-    - If the inertias of a body's links do not add up to the inertia of the body, the links are not
-      pieces.
+    - Each link with mass is a piece, if the inertias of the links of its body add up to the
+      inertia of the body.
+    - Each body is a piece. A body with only one link is the same piece as the link, and has the
+      name of the link.
     """
     model, found = robot._bare.model, dict[str, Piece]()
     bodies = ["base" if joint == ROOT else name for joint, name in enumerate(model.names)]
@@ -246,9 +247,9 @@ def as_inertia(piece: Piece) -> pin.Inertia:
 def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
     """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one link.
 
-    `mass` (N,) is the relative change of the link's mass without a change of the inertia about its
-    centre of mass. For the other arguments, see `_stretched`: `inertia` and `com` are along the
-    axes of the link.
+    `mass` (N,) is a relative change of the link's mass by a point mass at the centre of mass, which
+    does not change the inertia about this point. The other arguments are as in `_stretched`, with
+    the components of `inertia` and `com` along the axes of the link.
     """
     body = as_inertia(piece)
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
@@ -260,8 +261,8 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     """Return the names of the coordinates that can move without kinetic energy; usually none."""
     # A motion has no kinetic energy if it moves no centre of mass, rotates no body about an axis
-    # with inertia, and moves no joint with armature. The test asks only whether a mass or moment is
-    # zero. It does not use the value, because rounding errors could then hide such a motion.
+    # with inertia, and moves no joint with armature. The test uses only whether a mass or moment is
+    # zero. If it computed the kinetic energy, rounding errors could hide such a motion.
     bodies = robot.model.inertias.tolist()[ROOT:]
     masses = np.array([*map(attrgetter("mass"), bodies)])
     values, axes = np.linalg.eigh([*map(attrgetter("inertia"), bodies)])
@@ -308,7 +309,7 @@ def massless_note(robot: Robot) -> str:
 def require_inertia(robot: Robot) -> None:
     """Raise `SingularInertiaError` if M is singular at every configuration.
 
-    A factorisation of M may not detect this singularity, because of rounding errors.
+    Rounding errors may hide this singularity in a factorisation of M.
     """
     if robot.idle_coordinates:
         raise SingularInertiaError(massless_note(robot))

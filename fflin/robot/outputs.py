@@ -1,7 +1,7 @@
 """Outputs y of the linear model: measured quantities of a robot, in any combination and order.
 
-Reference axes are the axes of the reference placement, to which the state is relative. The module
-`fflin.dynamics.outputs` computes the outputs and their derivatives.
+Reference axes are the axes of the reference placement. The state is relative to this placement. The
+module `fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
 from dataclasses import dataclass, fields

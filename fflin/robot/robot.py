@@ -223,7 +223,7 @@ class Robot(Coordinates):
         return self._replaced(fields, merged=False)
 
     def merged(self, fields: Mapping[str, object]) -> Robot:
-        """Return a copy with other fields; joints and limits that are not named keep theirs."""
+        """Return a copy with other fields; springs and limits that are not named are unchanged."""
         if self.passive and isinstance(given := fields.get("passive"), list | tuple):
             fields = {**fields, "passive": [*self.passive, *given]}
         return self._replaced(fields, merged=True)
@@ -241,8 +241,8 @@ class Robot(Coordinates):
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
         checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
-        # If `merged`, all entries that are not named keep their values. Otherwise, only the entries
-        # of modes do.
+        # If `merged` is true, keep all entries that `fields` does not name. Otherwise, keep only
+        # the stiffness and damping of modes.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
             if key in checked:
@@ -323,7 +323,7 @@ class Robot(Coordinates):
         return self.with_bodies(mass_properties.random_bodies(self._bare.model, seed, **spreads))
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
-        """Return a copy of the robot with other inertias {joint index: body}, including wheels."""
+        """Return a copy with other inertias {joint index: inertia}, which include the wheels."""
         self.require_unchanged()
         bare = self._bare
         model = bare.model.copy()

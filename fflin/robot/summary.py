@@ -29,7 +29,7 @@ _SWING, _DAMPED = math.pi, 0.01
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:
-    """Return text about a robot's tree, masses and limits; `at_point` follows the heading."""
+    """Return text about a robot's tree, masses and limits, with `at_point` below its heading."""
     modes = {joint.name for joint in robot.modes}
     inputs = sum(len(names) for _, names in robot.named_inputs)
     counts = [
@@ -55,10 +55,10 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
 
 
 def _tree(robot: Robot) -> list[list[str]]:
-    """Return the rows of a table: the base, then the joints except modes in the order of the tree.
+    """Return a table with one row for the base and for each joint that is not a mode.
 
-    The name of a joint is indented by its depth in the tree. The masses of modes are added to their
-    carriers.
+    The joints are in the order of the tree, and their names are indented by their depth. The masses
+    of modes are added to their carriers.
     """
     model = robot.model
     masses = [body.mass for body in model.inertias.tolist()]
@@ -165,8 +165,8 @@ def draft(robot: Robot, urdf: str) -> str:
 def _candidates(robot: Robot) -> tuple[str, list[str]]:
     """Return suggested inputs as TOML text, and the names of joints that are probably wheels.
 
-    The inputs follow from the names of links, and are comments in the text. The names of joints are
-    TOML strings.
+    An input is suggested for each link with a name such as "wheel" or "thruster". All lines of the
+    text are TOML comments. The names of joints are quoted as TOML strings.
     """
     model, data = robot.model, robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())

@@ -151,8 +151,8 @@ def _appended(
 ) -> pin.Model:
     """Return a model with another model welded to a frame.
 
-    The joints of the other model come after all joints that the body with the frame already
-    carries.
+    In the order of the indices, the joints of the other model come after all joints that are
+    already on the body with the frame.
     """
     joint, at = find_frame(model, frame)
     other = other.copy()

@@ -1,5 +1,6 @@
 """Batches on disk: exact, whole or not at all, and resumed after a crash."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -132,6 +133,31 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path
     assert written == [16, 64] and told == [(48, 80), (64, 80), (80, 80)]
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
+
+
+def test_a_run_that_cannot_go_on_keeps_what_is_finished(robot, tmp_path, monkeypatch):
+    """The disk has become full since the first part of the run."""
+    path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
+    q = fflin.random_configurations(robot, 12)
+
+    def stop(done, _):
+        if done > 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fflin.sweep(robot, q, chunk=4, out=path, progress=stop)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "posix_fallocate", full)
+        with pytest.raises(fflin.FileError, match="No space left"):
+            fflin.sweep(robot, q, chunk=4, out=path)
+    assert part.exists()
+    counts = []
+    fflin.sweep(robot, q, chunk=4, out=path, progress=lambda done, _: counts.append(done))
+    assert counts == [8, 12] and path.exists() and not part.exists()
 
 
 @pytest.mark.compiled

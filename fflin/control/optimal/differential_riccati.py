@@ -97,8 +97,8 @@ def _constant(coefficients: Array, h: Array) -> Array:
     return np.array((T / of_states, G * of_costs, W / of_costs))
 
 
-# An interval: its start and end, its transitions (over the whole interval, the first half, and the
-# second half), and the coefficients at both ends.
+# An interval: the times of its start and end, the transitions over the whole interval, its first
+# half and its second half, and the coefficients at both ends.
 _Interval = tuple[float, float, Array, Array]
 
 
@@ -118,8 +118,8 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
 def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Array, Array]:
     """Integrate backwards from P at the last knot, and return the times and the values of P.
 
-    `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast, raise
-    `LinAlgError`.
+    The function `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast,
+    raise `LinAlgError`.
     """
     times, values = [float(knots[-1])], [P]
     for last in range(len(knots) - 1, 0, -_BATCH):
@@ -151,9 +151,9 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
     """Return K and P of all samples, the last sample first, and the largest relative residual."""
-    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost matrix of a sample, for
-    # the error at its start and the input. The second (nx, nx + nu) maps this error and the input
-    # to the next error.
+    # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost matrix for the error at
+    # the start of a sample and the input. The second (nx, nx + nu) maps this error and the input to
+    # the next error.
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole

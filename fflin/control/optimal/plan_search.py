@@ -14,17 +14,18 @@ from fflin.control.optimal.shooting import Point, Shooting
 # this.
 _ENDS = 1e-8
 
-# Within an interval, a limit applies to a state at a point only after an iterate has exceeded it
-# there, or at a neighbouring point, by _LIMITED times the limit. The limit is then tightened by the
-# fraction _TIGHTER, because the motion may exceed it between the points.
+# Within the intervals, a limit applies only where it is needed. If an iterate exceeds the limit at
+# a point there by more than _LIMITED times the limit, the limit applies at this point and its
+# neighbours from then on. It is tightened by the fraction _TIGHTER, because the motion may exceed
+# it between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
 # If no gap between intervals exceeds this, the gaps count as closed, and the plan is integrated as
 # one motion.
 _MEETS = 1e-10
 
-# When a plan is first integrated as one motion, its violations are corrected only if their sum is
-# at most half of this.
+# After a plan is first integrated as one motion, its violations are corrected only if their sum
+# is at most half of this value. Later sums must be at most half of the previous sum.
 _NEARLY = 1e-3
 
 # Accuracy [rad, m, s] of the integration over an interval: _SEEKS during the search, and _FLIES
@@ -32,19 +33,19 @@ _NEARLY = 1e-3
 _SEEKS, _FLIES = 1e-6, 1e-8
 
 # The search ends after _MOST iterations. It ends earlier if an iteration adds no limit within the
-# intervals and the predicted reduction of the merit function is at most _SAVED times its value.
-# The gaps are closed in at most _MOST_CLOSING iterations. At most _MOST_HALVINGS lengths of a step
-# are tried.
+# intervals and the predicted reduction of the merit function is at most _SAVED times the function.
+# The line search tries at most _MOST_HALVINGS step lengths. The gaps are closed in at most
+# _MOST_CLOSING iterations.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
-# Additional cost of a step of the wheel angles and rates, relative to the additional cost of a step
-# of the other states. It is small, because wheels may turn far and fast.
+# Levenberg-Marquardt cost of a step of the wheel angles and rates, relative to this cost for the
+# other states. It is small, because wheels may turn far and fast.
 _OF_WHEELS = 1e-6
 
-# The search fails if, over _STAGNANT iterations, the solutions of the quadratic programs violate
-# the goal or the limits at the knots by more than _HOPELESS [rad or m], and this violation does not
-# fall by a tenth. Smaller violations are due to the finite penalty. They vanish when the gaps are
-# closed.
+# After each quadratic program, the violation of the goal and of the limits at the knots is computed
+# [rad or m]. The search fails if this violation stays above _HOPELESS for _STAGNANT iterations
+# without falling by a tenth. Smaller violations are due to the finite penalty, and vanish when the
+# gaps are closed.
 _STAGNANT, _HOPELESS = 10, 1e-2
 
 # Penalty for a violation of the goal or a limit by 1 rad or 1 m. The cost of the initial guess
@@ -68,15 +69,16 @@ class Trial(NamedTuple):
         return float(np.abs(self.missed).max())
 
     def outside(self, limited: Mask) -> float:
-        """Return the sum of limit violations at knots and at `limited` points within intervals."""
+        """Return the sum of limit violations at knots, and at the points in the mask `limited`."""
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
 
 class Search(NamedTuple):
     """Search for the inputs of least effort from a start state to an end state."""
 
-    # The Hessian is the Gauss-Newton approximation. The additional cost of a step of the states is
-    # reduced after a full step and raised after a short step (Levenberg-Marquardt).
+    # The Hessian is the Gauss-Newton approximation. As in the Levenberg-Marquardt method, a step of
+    # the states has an additional cost, which is reduced after a full step and raised after a short
+    # step.
 
     shooting: Shooting
     start: Point
@@ -148,7 +150,7 @@ class Search(NamedTuple):
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
-        """Return a mask (N, parts - 1, nx) of points that exceed a limit, and their neighbours."""
+        """Return a mask (N, parts - 1, nx): values that exceed a limit, and their neighbours."""
         beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self.size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
@@ -158,12 +160,12 @@ class Search(NamedTuple):
     def _step(
         self, trial: Trial, limited: Mask, near: Array, effort: Array, left: list[float]
     ) -> tuple[Array, Array, Array, float] | None:
-        """Return the optimal steps of the knots and of the inputs, or None if no step helps.
+        """Return the optimal steps of the knots and of the inputs, or None if the search fails.
 
         The other two results are the multipliers of the gaps, and the sum of the limit violations
-        after the step. `left` contains the violation at the knots after each earlier quadratic
-        program, and the violation after this program is appended. If the violation is large and
-        has not fallen by a tenth in `_STAGNANT` iterations, no step helps.
+        after the step. The list `left` contains the violation at the knots after each quadratic
+        program; this method appends a value. The search fails if the motion diverges, if the
+        quadratic program has no solution, or if the violation does not fall (see `_STAGNANT`).
         """
         u, nx = trial.u, self.shooting.state.nx
         if not max(trial.outside(limited), trial.gap) < np.inf:
@@ -214,8 +216,8 @@ class Search(NamedTuple):
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
-                # `one` is integrated as one motion. If its violation is more than half of the
-                # previous violation, errors grow too fast along the motion to be corrected. Then
+                # `one` is the plan, integrated as one motion. If its violation is more than half of
+                # the previous violation, errors grow too fast along the motion to be corrected, and
                 # the trial with separate intervals is returned.
                 if not last <= 0.5 * before:
                     return trial

@@ -26,8 +26,8 @@ _NEAR = 1e-3
 _APART = 1e-5
 
 # A pole is near the stability boundary if its distance from the boundary, relative to the largest
-# pole magnitude, is below this. If Q does not weight an undamped mode, its pole stays on the
-# boundary, but rounding errors move the pole by such a distance.
+# pole magnitude, is below this. An undamped mode without weight in Q has its pole exactly on the
+# boundary, but rounding errors move the computed pole by such a distance.
 _NEAR_BOUNDARY = 1e-6
 
 
@@ -300,7 +300,7 @@ class ModalMatrix:
 
     def lyapunov_modal(self, r: Values) -> Array:
         """Solve the equation of `lyapunov`, with r given as V^H r V."""
-        # In modal coordinates, each entry of the solution is the entry of r times a factor.
+        # In modal coordinates, each entry of the solution is the same entry of r times a factor.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 
@@ -309,8 +309,9 @@ class ModalMatrix:
         M = self.inverse @ F @ self.V
         values = M.diagonal().astype(complex)
         M.flat[:: len(M) + 1] = 0.0
-        # Divide each column of the off-diagonal part M by the diagonal entry of the column. The
-        # norm of the result bounds the relative errors of the diagonal entries as eigenvalues.
+        # The diagonal entries approximate the eigenvalues. Divide each column of the off-diagonal
+        # part M by its approximate eigenvalue. By the Bauer-Fike theorem, the norm of the result
+        # bounds the relative errors of the eigenvalues.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
         real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]

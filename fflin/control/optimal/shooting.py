@@ -105,9 +105,9 @@ class Shooting:
         return values
 
     def inside(self, motions: Motions, parts: int) -> Array:
-        """Return `limited_values` (N, parts, nx), with `parts` equal parts of each interval.
+        """Divide each interval into equal parts; return `limited_values` at the end of each part.
 
-        The values are taken at the end of each part.
+        The values have the shape (N, parts, nx).
         """
         every = (motions[0].shape[1] - 1) // parts
         return self.limited_values(*(each[:, every::every] for each in motions))

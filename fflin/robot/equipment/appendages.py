@@ -6,11 +6,12 @@ participation L (6, k). Its kinetic energy is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is modelled by a ball on a screw joint (16.4). The ball is a rigid body with the spatial
-inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its momentum ``I S`` is the mode's
-column of L. The modal mass, which is 1, consists of ``S^T I S``, and of a negative rotor inertia of
-the joint if the ball is lighter than in (16.4). The inertia of the ball is subtracted from the
-inertia of the link. Therefore the link and its balls together have the inertia in the URDF.
+Each mode is modelled by a ball on a screw joint, see (16.4) of docs/derivation.md. The ball is a
+rigid body with the spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its
+momentum ``I S`` is the mode's column of L. Its modal mass is ``S^T I S`` = 1. If the link is too
+light for this ball, a lighter ball is used. Its ``S^T I S`` exceeds 1, and a negative rotor inertia
+of the joint reduces the modal mass to 1. The inertia of the ball is subtracted from the inertia of
+the link. Therefore, the link and its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
-# First positive root of J_1'(x) = 0 with the Bessel function J_1. The first lateral mode in a
-# circular cylinder has the wavenumber x / radius.
+# First positive root x of J_1'(x) = 0, where J_1 is a Bessel function. The first lateral sloshing
+# mode in a circular cylinder has the wavenumber x / radius.
 _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
@@ -441,8 +442,8 @@ Appendage: TypeAlias = FlexibleAppendage | Slosh
 
 def rigid_inertia(M: Array) -> pin.Inertia:
     """Convert a rigid-body mass matrix (6, 6), with translation before rotation, to an inertia."""
-    # Pinocchio's parameters are the mass, the three first moments, and the moments of inertia in
-    # the order xx, xy, yy, xz, yz, zz.
+    # Pinocchio's parameters are the mass, the mass times the centre of mass (x, y, z), and the
+    # moments of inertia in the order xx, xy, yy, xz, yz, zz.
     entries = M[[0, 1, 2, 0, 3, 3, 4, 3, 4, 5], [0, 5, 3, 4, 3, 4, 4, 5, 5, 5]]
     return pin.Inertia.FromDynamicParameters(entries)
 

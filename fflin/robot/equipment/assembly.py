@@ -1,11 +1,12 @@
 r"""Equipment of a robot: reaction wheels, flexible appendages and slosh, as joints of its model.
 
-Each mode of a flexible appendage is modelled by a ball on a screw joint (16.4). The ball is a rigid
-body with the spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its momentum
-``I S`` is the mode's column of the modal participation L (6, k). The modal mass, which is 1,
-consists of ``S^T I S``, and of a negative rotor inertia of the joint if the ball is lighter than in
-(16.4). The inertia of the ball is subtracted from the inertia of the link. Therefore the link and
-its balls together have the inertia in the URDF.
+Each mode of a flexible appendage is modelled by a ball on a screw joint, see (16.4) of
+docs/derivation.md. The ball is a rigid body with the spatial inertia ``I``, and moves by the twist
+``S`` per unit amplitude. Its momentum ``I S`` is the mode's column of the modal participation L
+(6, k). Its modal mass is ``S^T I S`` = 1. If the link is too light for this ball, a lighter ball is
+used. Its ``S^T I S`` exceeds 1, and a negative rotor inertia of the joint reduces the modal mass to
+1. The inertia of the ball is subtracted from the inertia of the link. Therefore, the link and its
+balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -41,14 +42,15 @@ _AGREE = 1e-2
 # must be positive, because CRBA adds inertias from the tips of the tree to the base, and each sum
 # must have a positive mass.
 _LARGEST_SHARE = 0.9
-# If the distance of a ball from the frame of its appendage is at least this fraction of the body's
-# radius of gyration, the displacement of the ball counts as a rotation about the frame.
+# A displacement of a ball counts as a rotation of its appendage about the appendage's frame only if
+# the distance of the ball from this frame is at least this fraction of the body's radius of
+# gyration.
 _SHORTEST = 0.05
-# Least mass of a ball, as a fraction of the mass (16.4) that requires no rotor inertia.
+# Least mass of a ball, as a fraction of the mass mu that satisfies (16.4) without a rotor inertia.
 _LIGHTEST = 1e-6
-# The translation part of a participation counts as zero if it is at most this fraction of the
-# rotation part, and vice versa. For this comparison, the translation part is multiplied by a length
-# of the body.
+# A participation consists of a translation (3,) and a rotation (3,). Either of them counts as zero
+# if its norm is at most this fraction of the norm of the other. To compare them in the same unit,
+# the translation is multiplied by a length, such as the radius of gyration of the body.
 _NONE = 1e-14
 
 # Fields of a robot that have joint names as keys. A key may also be GROUP.JOINT, with a group of
@@ -118,7 +120,10 @@ def equipped(
 
 
 def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
-    """Return a mapping, and all mappings in it, without the keys that match only removed joints."""
+    """Return a mapping without the keys that match only removed joints.
+
+    Mappings inside this mapping are reduced in the same way.
+    """
     removed, others = ([f"{of}.{x}" for of in _GROUPS for x in names] for names in (gone, left))
     return {
         key: _without(value, gone, left) if isinstance(value, Mapping) else value
@@ -183,7 +188,7 @@ class Mounted(NamedTuple):
 def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
     """Return a model with new joints for `parts`; the old joints get the inertias `bodies`.
 
-    A new joint comes after all joints that its carrier already carries.
+    In the order of the indices, a new joint comes after all other joints on its carrier.
     """
     new, names = with_marked_frames(model)
     for part in parts:
@@ -244,7 +249,7 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
 
 
 def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
-    """Return the momentum of all wheels without inertia, as a sum for each joint that carries them.
+    """Return the constant momentum of the wheels without inertia, summed for each carrying joint.
 
     Each entry is (index of the joint, angular momentum (3,) [N m s] in the axes of the joint).
     """
@@ -272,8 +277,8 @@ def _mounted_wheels(
         rest = bodies[joint] - spinning
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # Also refuse a wheel whose inertia equals the inertia of the link up to rounding errors,
-        # because the link is then the wheel itself.
+        # Also refuse a wheel whose inertia is, up to rounding errors, the whole inertia of the link
+        # about the wheel's axis. Such a link is the wheel itself.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
@@ -298,7 +303,7 @@ def _carrier_name(model: pin.Model, joint: int) -> str:
 def turned_to(axis: Array) -> Array:
     """Return a rotation matrix (3, 3) that maps z to an axis.
 
-    The matrix is exact if the axis is x, y or z.
+    The matrix has no rounding errors if the axis is x, y or z.
     """
     beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     beside /= np.linalg.norm(beside)
@@ -306,9 +311,10 @@ def turned_to(axis: Array) -> Array:
 
 
 def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
-    """Return the joint that carries an appendage, the placement, and the participation L (6, k).
+    """Return the joint that carries an appendage, its placement, and its participation L (6, k).
 
-    The placement and L are in the frame of this joint, and L is about its origin.
+    The placement of the appendage is relative to the joint. L is in the axes of the joint, about
+    the origin of the joint.
     """
     joint, placement = find_frame(model, item.frame)
     return joint, placement, placement.toDualActionMatrix() @ item.participation
@@ -369,9 +375,9 @@ def _mounted_modes(
 def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
     """Return the effective masses and moments of inertia (6,) of each mode, as {mode: values}.
 
-    The values are along the axes of the appendage's frame and about its origin. Each value is a
-    fraction of the corresponding mass or moment of the rigid inertia. The rigid inertia is from the
-    file of the appendage. If there is no file, it is the inertia of the carrying body.
+    Each value is a fraction of the corresponding mass or moment of the rigid inertia, along the
+    axes and about the origin of the appendage's frame. The rigid inertia is from the file of the
+    appendage. If there is no file, it is the inertia of the carrying body.
     """
     found: dict[str, Array] = {}
     for item in appendages:
@@ -454,11 +460,11 @@ def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Arra
 def _ball(
     joint: int, body: pin.Inertia, name: str, column: Array, p: Array, lighter: float = 1.0
 ) -> Mounted:
-    """Return the ball that models a mode (16.4).
+    """Return the ball that models a mode by (16.4).
 
     `column` (6,) is the mode's participation about the body's origin. `p` (3,) is the origin of the
-    appendage's frame. `lighter` is the ball's mass as a fraction of the mass (16.4), with which the
-    joint needs no rotor inertia.
+    appendage's frame. `lighter` is the mass of the ball, as a fraction of the mass mu in (16.4). If
+    `lighter` is 1, the joint needs no rotor inertia.
     """
     # Compute the participation (t, r) about the origin of the appendage's frame. About this point,
     # a mode that only translates has r = 0.
@@ -476,9 +482,10 @@ def _ball(
         r, rest = np.zeros(3), 0.0
     moment = rest**2 + size**2 * square if rest else 0.0
     mass = square + (rest / size) ** 2 if square else 0.0
-    # Per unit amplitude, the ball rotates by |w| = rest / moment, and its centre moves by
-    # |v| = |t| / mass. The centre is at the distance `lever` from the appendage's frame. Therefore
-    # the structure rotates by at most |w| + |v| / lever.
+    # Bound the rotation of the appendage for a unit amplitude. The ball rotates by
+    # |w| = |r| / moment. Its centre moves by |v| = |t| / mass, which is a rotation by at most
+    # |v| / lever about the appendage's frame, because `lever` is the distance of the centre from
+    # this frame. The bound is the sum |w| + |v| / lever.
     rotation = rest / moment if moment else 0.0
     if mass and lever >= _SHORTEST * size:
         rotation += math.sqrt(square) / mass / lever
@@ -492,8 +499,8 @@ def _ball(
     else:
         axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
         origin, motion = center, pin.JointModelPZ()
-    # A ball that is lighter than in (16.4) has S^T I S > 1. A negative rotor inertia restores the
-    # modal mass of 1: S^T I S + rotor = 1.
+    # If the ball is lighter than the mass mu in (16.4), S^T I S exceeds 1. A negative rotor inertia
+    # restores the modal mass of 1: S^T I S + rotor = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)

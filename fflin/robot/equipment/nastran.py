@@ -23,9 +23,9 @@ MASSES = {
 # Names of the mass matrix and of the stiffness matrix in the files of different programs.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Largest relative rounding error of a matrix. A file is refused if a larger error makes a matrix
-# asymmetric. It is also refused if a larger stiffness couples the boundary to the modes, or resists
-# a rigid motion.
+# Values up to this fraction of the largest value of a matrix count as rounding errors. A file is
+# refused if one of these values is larger: the asymmetry of a matrix, the stiffness that couples
+# the boundary to the modes, or the stiffness that resists a rigid motion.
 _SHARE = 1e-6
 
 

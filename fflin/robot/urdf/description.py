@@ -18,9 +18,9 @@ FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floatin
 # Value that stands for a missing limit in the Pinocchio model.
 UNLIMITED = sys.float_info.max
 
-# Largest coordinate of an <origin>. At 1e8 m, adding 1 m^2 to the square of the length does not
-# change it in double precision. The moments of inertia of links would be lost in such sums, and ABA
-# would divide zero by zero.
+# Largest coordinate of an <origin>. In double precision, 1e8^2 + 1 equals 1e8^2. At a distance of
+# 1e8 m, a link's moments of inertia would therefore be lost in the sum with mass * distance^2, and
+# ABA would divide zero by zero.
 _FARTHEST = 1e7  # [m]
 
 # Tolerance of the length of a quaternion. It is large, because many files give only four digits.

@@ -62,8 +62,8 @@ def describe(document: bytes, path: Path) -> Urdf:
     links, joints = description.read_tree(root)
     mimics = description.resolve_mimics(joints)
     # The position of a continuous joint does not count full turns, but the position of a revolute
-    # joint does. If a full turn of a continuous leader displaces its mimic joint, make the leader a
-    # revolute joint without limits.
+    # joint does. Full turns of a leader must be counted if one full turn displaces its mimic joint.
+    # In this case, make a continuous leader a revolute joint without limits.
     for name, (leader, multiplier, _) in mimics.items():
         turning = joints[leader].type == "continuous"
         if turning and not (joints[name].type == "continuous" and multiplier.is_integer()):
@@ -128,9 +128,9 @@ def ignored(
 ) -> Iterator[tuple[str, tuple[str, ...], str]]:
     """Yield a warning (field, joints, text) for each property of joints that fflin ignores.
 
-    The properties are damping, friction, and zero limits of effort or velocity. The warning is
-    unnecessary if the robot has a field of this name that contains all of these joints. A robot has
-    the fields "damping" and "passive", but no field "friction".
+    The properties are damping, friction, and zero limits of effort or velocity. `field` is
+    "damping", "friction" or "passive". The warning is unnecessary if the robot's field of this name
+    contains all of these joints. A robot has no field "friction".
     """
     moving = [joint for joint in joints.values() if joint.freedom]
     for field, effect in (("damping", "damping"), ("friction", "Coulomb friction")):
@@ -166,8 +166,8 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
         if kind in ("revolute", "prismatic") or joint.limits:
             inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
         parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
-    # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. From version 1.2 on,
-    # it would require limits.
+    # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. For version 1.2 or
+    # higher, urdfdom would require limits.
     return _tag("robot", {"name": name, "version": "1.1"}, "\n".join(parts))
 
 

@@ -8,7 +8,7 @@ import sys
 
 
 def main(path: str, limit: float) -> None:
-    """Expand a document from stdin; write included files as one JSON line, then the URDF."""
+    """Expand a document from stdin; write one JSON line with the included files, then the URDF."""
     import contextlib
     import faulthandler
     import json

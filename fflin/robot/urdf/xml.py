@@ -157,7 +157,7 @@ class Element:
 
 
 def decimal(text: str) -> float:
-    """Return the decimal number in a text, which may be infinite, or NaN for any other text."""
+    """Return the value of a text that is a decimal number or "inf"; NaN for any other text."""
     return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
@@ -172,7 +172,7 @@ def enumerated(names: Iterable[str]) -> str:
 
 
 def named(kind: str, names: Sequence[str]) -> str:
-    """Return names after their kind, such as "joint 'a'" or "joints 'a', 'b'"."""
+    """Return a noun with quoted names, such as "joint 'a'" or "joints 'a', 'b'"."""
     return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
 
 
