@@ -24,7 +24,7 @@ class Wheels(
     r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
 
     A torque u changes the speed w by u dt / J in a step of dt [s]. J = 1 / (M^-1)_ii is the
-    effective inertia of the wheel's joint i in the free-floating robot.
+    effective inertia of the wheel in the free-floating robot, and i is the index of w in nu.
 
     - `at`: index of the wheel's input. `row`: index of the wheel's speed in nu.
     - `least_torque`, `most_torque` [N m]: torque limits of the motor.
@@ -220,7 +220,7 @@ ARGUMENTS = Struct(
 
 
 def _combine(shares, row, rates, out):
-    """Write the sum of the rows of `rates`, weighted by a row of `shares`.
+    """Write the sum of the rows of `rates`, with the weights in a row of `shares`.
 
     The first row of `rates` is the value of nu, or of the state z of a filter, at the start of the
     step. The other rows are the time derivatives of nu, or of z, at the stages.

@@ -36,7 +36,7 @@ class Path(
       polynomial is the time since the start of its interval. From `last` [s] after the start of the
       trajectory, the gain is constant.
     - `ends`: True if the trajectory ends before the run. In this case, `q`, `u`, `speed` and `K`
-      have one further row, which applies at times of the run after `over` [s].
+      have one further row, which applies after the time `over` [s] of the run.
     - Work space: `along` (6 + n,) for a displacement, `e` (nx,) for the error, and `point` for the
       followed point.
     """
@@ -102,7 +102,7 @@ def track(robot, path, point, u, t):
 
     Wrenches of the trajectory in world axes are rotated to the axes of the trajectory's base.
     """
-    # Evaluate the trajectory at this time.
+    # Evaluate the trajectory at the time t.
     there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)
     time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
     k, s = _placed(knots, time)
@@ -161,8 +161,8 @@ class Law(
       axes of each gyroscope, in the axes of its body.
     - `y` (ny,): the outputs, which are the entries `measured` of x plus noise. The noise of each
       sample is one row of `added` (slots, ny). After the last row, the first row is used again.
-    - `turned` (2,): for omega_b and for v_b of the state, True if in reference axes, False if in
-      base axes.
+    - `turned` (2,): for omega_b and for v_b, True if the state contains this velocity in reference
+      axes, False if in base axes.
     - `origin` (rows, 7): pose of the world frame relative to the reference, which is the pose of
       the base at which q_b and r_b are 0.
     - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint

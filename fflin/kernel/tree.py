@@ -198,7 +198,7 @@ class Tree(
     - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta in joint axes.
     - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
-    The other fields are offsets in the work space, except `size`, the size of the work space.
+    `size` is the size of the work space. The other fields are offsets in the work space.
     """
 
 

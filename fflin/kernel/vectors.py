@@ -243,7 +243,7 @@ def cosine_and_sine(x):
 
 
 def _series(first):
-    """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
+    """Return the function of x that computes sum_k (-x)^k first! / (first + 2 k)!."""
     shares = [
         (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k) for k in range(_TERMS)
     ]

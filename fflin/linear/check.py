@@ -298,7 +298,10 @@ def _output_errors(
 
 
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
-    """Return the certificate of a continuous-time model; A and B are compared with ABA."""
+    """Return the certificate of a continuous-time model.
+
+    The certificate contains the largest errors of A and of B, compared with ABA derivatives.
+    """
     aba = Aba(StateMap(robot, reference=lin.reference, frame=lin.frame))
     A, B, _ = aba_route(aba, lin.q, lin.v, lin.u0, moving=lin.moving)
     errors = Scales(aba, lin, lin.M, B).errors(A, B)

@@ -276,7 +276,7 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 _EPS = float(np.finfo(float).eps)
 
 # Largest allowed residual, as a fraction of the forces to be balanced. Also the largest velocity of
-# the base that counts as zero.
+# the base [rad/s or m/s] that counts as zero.
 TOLERANCE = 1e-9
 
 

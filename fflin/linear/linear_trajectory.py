@@ -256,7 +256,7 @@ _BATCH = 64
 
 
 class Steps(NamedTuple):
-    """The m integration steps of a sample. In each, F = [[A, B], [0, 0]] is constant."""
+    """The m integration steps of a sample. In each step, F = [[A, B], [0, 0]] is constant."""
 
     F: Array  # (m, nx + nu, nx + nu)
     h: Array  # (m,) [s]

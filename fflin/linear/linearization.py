@@ -121,7 +121,7 @@ class Prepared:
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
-    """Return the base placement (7,) at a model's point, which is the default reference."""
+    """Return the default reference: the base placement (7,) at the point of a model."""
     root, q = robot.model.jointPlacements[ROOT], lin.q[:7]
     return q if root.isIdentity(0.0) else frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
 
@@ -238,7 +238,7 @@ class Linearizer:
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Whether B is the only matrix to be computed for a model at rest. This requires the default
-        # inputs, outputs and reference, and a robot without springs, gravity, orbit and stored
+        # inputs, outputs and reference, and a robot without springs, gravity, orbit or stored
         # momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 

@@ -1,4 +1,4 @@
-"""Linear model: matrices, names, units, and its certificate."""
+"""Linear model: matrices, names and units of the signals, and certificate."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StateSpace(Result):
-    """Matrices of a linear model about a point, with names and units of its signals."""
+    """Matrices of a linear model about a point, with names and units of the signals."""
 
     A: Array
     B: Array
@@ -183,8 +183,8 @@ class LinearModel(StateSpace):
 
     def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
         # The generated `__init__` of a frozen dataclass would set three dozen fields one by one.
-        # This would take as long as the dynamics of a small robot. Instead, `shared` contains the
-        # fields that are equal in all models of a robot.
+        # This would take as long as the dynamics of a small robot. Instead, all fields are set at
+        # once, and `shared` contains the fields that are equal in all models of a robot.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())

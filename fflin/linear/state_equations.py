@@ -62,7 +62,7 @@ def assemble(
     # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # Do not rotate the columns of the base's linear velocity, because they are still zero.
+        # Do not rotate the columns of the base's linear velocity: they are zero until (4.5) below.
         chart.turn_rows((ANGULAR,) if omega_in_reference else (), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)

@@ -14,8 +14,8 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Step of complex-step differentiation along a motion. The step is so small that its square vanishes
-# in every sum by rounding. So the derivatives are exact to machine precision.
+# Step of complex-step differentiation along a motion. The step is so small that its square is
+# lost by rounding in every sum. So the derivatives are exact to machine precision.
 _STEP = 1e-20j
 
 _NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
@@ -186,14 +186,14 @@ class ToolCoordinates:
     def _held(self, parts: Array) -> Array:
         """Return the derivative (6, 3) of two vectors with respect to a base rotation (4.4).
 
-        The components of both vectors are in base axes. If the tool gives a vector in world axes,
-        it is constant in the world, and its components in base axes depend on the rotation. If the
-        tool gives it in base axes, the derivative is zero.
+        `parts` (6,) contains both vectors in base axes. A vector that the tool gives in world axes
+        is constant in the world, so its components in base axes depend on the rotation. The
+        derivative of a vector that the tool gives in base axes is zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
-        """Return the derivatives at a point with Pinocchio's q, and with nu and u in base axes.
+        """Return the `Jacobians` at a point, given by Pinocchio's q, and nu and u in base axes.
 
         `rates` (6 + n,) is d(nu)/dt.
         """
@@ -255,7 +255,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement on the root link of its centre of mass, with the axes of its inertia."""
+    """Return the placement of the root link's inertial frame: centre of mass, axes of inertia."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):
