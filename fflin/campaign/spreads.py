@@ -161,9 +161,10 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
 def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     """Return the inverse distribution function of a spread.
 
-    A number is the standard deviation of a normal distribution; if `fixed`, it is the value of all
-    runs. A function of this module is returned as a `partial` object. Otherwise, the method `ppf`
-    of the distribution is returned, which can be slow.
+    A number is the standard deviation of a normal distribution; if `fixed` is true, the number
+    itself is the value in all runs. For a distribution of scipy.stats, the method `ppf` is
+    returned, which can be slow. For any other spread, a function of this module is returned as a
+    `partial` object.
     """
     if hasattr(spread, "ppf"):
         try:

@@ -323,7 +323,10 @@ def _points(
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Return a context with a progress bar; after Ctrl-C, it reports how to resume the command."""
+    """Return a context with a progress bar.
+
+    After Ctrl-C, the raised `KeyboardInterrupt` states how to resume the command.
+    """
     from fflin.batch.files import part_of
 
     bar = Progress()
