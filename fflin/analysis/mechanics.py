@@ -336,7 +336,7 @@ def undecided(
 def shape(lin: LinearModel, at: Values) -> str:
     """Describe a motion by its largest coordinates.
 
-    `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
+    The vector `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
     """
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]

@@ -167,7 +167,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
+        """Remarks on missing data, and on modes of undecided stability (due to rounding errors)."""
         notes = [
             f"undecided: the mode at {mode.frequency:.4g} rad/s may grow or decay, because the "
             f"real part of its pole is only {mode.margin:.1g} times the rounding error"
@@ -344,7 +344,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """List the bodies with at least 1 % of the energy, and add up the energy of the others.
+    """List bodies or joints with at least 1 % of the energy, and the total of all others.
 
     The list is shortened until it fits into `room` characters.
     """

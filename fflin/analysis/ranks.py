@@ -82,7 +82,7 @@ class FixedPoles(NamedTuple):
     """Poles of the uncontrollable or unobservable part."""
 
     poles: Values = np.zeros(0)  # (k,) [1/s], or discrete-time poles
-    decays: bool = True  # whether all these poles decay, beyond rounding error
+    decays: bool = True  # True if all these poles decay by more than rounding error
     margin: Margin = Margin()  # margin of the rank decisions
     settling: Margin = Margin()  # certainty that the slowest pole decays
 

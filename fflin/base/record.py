@@ -78,7 +78,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: No such file{writing.missing(path)}") from None
-    except Exception as error:  # each decoder raises its own types
+    except Exception as error:  # each decoder raises its own types of errors
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
         why = writing.reason(error)
