@@ -225,14 +225,14 @@ def controllability(lin: LinearModel) -> Controllability:
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
 ) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
-    """Find the controllable subspace of a model at rest, without its conserved momenta.
+    """Find the controllable subspace of a model at rest whose conserved momenta are removed.
 
-    The subspace is expressed in 2 r states: the r kept coordinates of `conserved` and their rates.
+    The subspace is expressed in 2 r states: the r coordinates `conserved.kept` and their rates.
     Return None if the model is not at rest or the test is inconclusive. Otherwise return five
     results:
 
     - a basis (2 r, d) of the controllable subspace;
-    - rows (2 r - d, 2 r): combinations of states on which no input acts;
+    - a matrix (2 r - d, 2 r), whose rows are combinations of states on which no input acts;
     - the names of these rows, or None if the caller must form the names from the state names;
     - the name of the method;
     - the fixed poles.
@@ -243,16 +243,17 @@ def _by_second_order(
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # The inputs act on every momentum that is not conserved, so all 2 r states are
-        # controllable.
+        # S has rank r: the inputs can accelerate the r coordinates independently, so all 2 r states
+        # are controllable.
         everything = np.eye(2 * r)
         return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
     S = system.S.T
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
-    # M, K and D are symmetric. Each motion (s, v) that is unobservable from the output S^T s
-    # therefore gives one row: a combination of states on which no input acts.
+    # M, K and D are symmetric, so the system with the output S^T s is the dual of the system with
+    # the input matrix S. Each motion (s, v) that this output does not observe gives one combination
+    # of states on which no input acts: the row (s^T D + v^T M, s^T M).
     motions, shapes, fixed = found
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
@@ -266,8 +267,8 @@ def _by_second_order(
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed
-    # Without damping, each row gives the modal coordinate, or its rate, of a vibration or an
-    # instability that no input drives.
+    # Without damping, the states on which no input acts are modal coordinates of vibrations and
+    # instabilities, and the rates of these coordinates.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, of_pole in shapes:
@@ -374,7 +375,7 @@ def _reached(
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
     # rounding error. Poles therefore count as equal if they are closer than 1e-3 times the largest
-    # modulus of a pole (of z - 1 for discrete-time poles z).
+    # modulus of a pole. For discrete-time poles z, the modulus of z - 1 replaces this modulus.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & unstable
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:

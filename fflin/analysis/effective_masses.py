@@ -15,9 +15,8 @@ from fflin.linear.model import LinearModel
 # Two frequencies count as equal if their relative difference is at most this.
 _EQUAL = 1e-9
 
-# Effective masses and moments of inertia below this fraction of the total are rounding error. They
-# are squares of singular values, so singular values are squared before they are compared with this
-# limit.
+# Effective masses and moments of inertia below this fraction of the total are rounding error. The
+# code computes singular values, whose squares are the effective masses and moments of inertia.
 _ROUNDING = 1e-14
 
 
@@ -185,7 +184,7 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
 
 
 def _separated(frequencies: Array, L: Array) -> Array:
-    """Combine modes of equal frequency so that the first of them has the most effective mass.
+    """Combine modes of equal frequency so that the first has the largest effective mass.
 
     The columns of L (6, k) are the participation factors of the modes.
     """

@@ -1,8 +1,9 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
 `split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B] at
-each pole s. `unobservable` tests a second-order system by the null space of [p^2 M + p D + K; C_s +
-p C_v] at each pole p. The second test is less sensitive to rounding.
+each pole s. `unobservable` tests a second-order system M a + D v + K s = 0 with the output C_s s +
+C_v v, by the null space of [p^2 M + p D + K; C_s + p C_v] at each pole p. The test of second-order
+systems is less sensitive to rounding.
 """
 
 from operator import itemgetter
@@ -13,11 +14,11 @@ from fflin.analysis import ranks
 from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
-# Singular values are computed only at suspicious eigenvalues. An eigenvalue is suspicious if
-# another eigenvalue is closer than _SUSPICIOUS. It is also suspicious if the product of its left
-# eigenvector and the input matrix has a norm below _SUSPICIOUS, where the columns of the input
-# matrix have unit length. The refinement of a pole stops if the smallest singular value exceeds
-# _SUSPICIOUS, because it is then certainly not zero.
+# Singular values of [A - s I, B] are computed only at suspicious eigenvalues s of A. The columns of
+# B have unit length. An eigenvalue is suspicious if another eigenvalue is closer to it than
+# _SUSPICIOUS. It is also suspicious if its left eigenvector y is nearly orthogonal to these
+# columns: |y^H B| < _SUSPICIOUS. The refinement of a pole stops if the smallest singular value
+# exceeds _SUSPICIOUS, because this singular value is then certainly not zero.
 _SUSPICIOUS = 1e-3
 
 # Rounding splits a multiple eigenvalue into several poles, which are refined separately. Refined
@@ -36,9 +37,9 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # model.
 _ALIASED = 1e-6
 
-# A pole may belong to a defective pair at zero if its decay rate in scaled time is below this.
-# Rounding moves such a pair by the square root of the rounding error. For discrete-time poles z, 1
-# - |z| replaces the decay rate.
+# A pole may belong to a defective pair at zero if its decay rate is below this, in the unit of time
+# of `split_by_poles`. Rounding moves such a pair by the square root of the rounding error. For
+# discrete-time poles z, the decay per sample, 1 - abs(z), replaces the decay rate.
 _DECAY = 1e-7
 
 # If a motion decays to less than this fraction within one sample, only its rounding error remains.
@@ -53,14 +54,15 @@ def split_by_poles(
     Return four results:
 
     - a basis (nx, d) of the controllable subspace;
-    - a basis (nx, nx - d) of its complement, which is the unobservable subspace if `dual`;
-    - rows (nx - d, nx): combinations of states on which no input acts;
+    - a basis (nx, nx - d) of a complement, which is the unobservable subspace if `dual`;
+    - a matrix (nx - d, nx), whose rows are combinations of states on which no input acts;
     - the fixed poles.
     """
-    # X is A, or (A - I)/dt of a sampled model; `drive` is B, or C^T of the dual pair. The states
-    # are scaled to units of energy, x = to_x xi. Velocities nu are scaled to L^T nu with M = L L^T,
-    # so that the squared length of L^T nu is twice the kinetic energy. Positions p are scaled to
-    # L^T N^-1 p with dp/dt = N nu, and divided by a unit of time that gives A a norm of about 1.
+    # X is A, or (A - I)/dt of a sampled model. The matrix `drive` is B, or C^T of the dual pair.
+    # The states x = to_x xi are scaled to states xi in units of energy. Velocities nu become
+    # L^T nu with M = L L^T: the squared length of L^T nu is twice the kinetic energy. Positions p
+    # with dp/dt = N nu become L^T N^-1 p, divided by a unit of time. This unit is chosen so that
+    # the scaled A has a norm of about 1.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
@@ -71,11 +73,12 @@ def split_by_poles(
     A = from_x @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
-    # Without forces, the unit of time is arbitrary.
+    # If no force depends on the state, the unit of time is arbitrary.
     unit = 1.0 / rate if rate > 0.0 else 1.0
     if dt:
-        # If the sample time is the period of the only vibration, X contains rounding errors instead
-        # of the spring forces. The unit of time derived from X would then be too long.
+        # If the sample time is the period of the only vibration, the state returns to its initial
+        # value in each sample. X then contains rounding errors instead of the spring forces, and
+        # the unit of time derived from X would be too long.
         unit = min(unit, 100.0 * dt)
     stretch = np.repeat((unit, 1.0), nv)
     to_x, from_x = to_x * stretch, from_x / stretch[:, None]
@@ -86,9 +89,9 @@ def split_by_poles(
     noise = len(X) * ranks.EPS * float(np.linalg.cond(M / np.outer(root, root)))
     if dt:
         noise = max(noise, ranks.EPS * (unit / dt + float(np.linalg.norm(A, 2))))
-    # Orthogonal transformations split off left null vectors until none remain. This also removes
-    # the whole Jordan chain of a defective eigenvalue. A staircase algorithm is not used, because
-    # it would carry the rounding error of an ill-conditioned step into the next step.
+    # Orthogonal transformations split off left null vectors until none remain. For a defective
+    # eigenvalue, the repeated steps split off the whole Jordan chain. A staircase algorithm is not
+    # used, because it would carry the rounding error of an ill-conditioned step into the next step.
     A, to = (A.T, to_x.T) if dual else (A, from_x)
     B = ranks.unit_columns(to @ drive)
     inside, margin = np.eye(2 * nv), ranks.Margin()
@@ -110,7 +113,8 @@ def split_by_poles(
         least, most = int(decay.argmin()), int(decay.argmax())
         slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
         if dt and abs(poles[most]) < _DEAD:
-            # Two motions cannot be distinguished if both decay to rounding error within one sample.
+            # If two motions decay to rounding error within one sample, the samples cannot
+            # distinguish these motions.
             dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
             margin &= dead.transformed(1.0, halved=True)
         settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
@@ -169,16 +173,17 @@ def unobservable(
     C_s is `position` and C_v is `velocity`. Return three results:
 
     - a basis (2 nv, k) of these motions (s, ds/dt);
-    - the nonzero poles of these motions in continuous time, one of each conjugate pair, with the
-      shapes (nv, m) of each pole;
+    - the nonzero poles of these motions in continuous time, one of each conjugate pair, each with
+      its m mode shapes (nv, m);
     - the fixed poles.
 
     Return None if the test is inconclusive, that is, if K or D is not symmetric, D is indefinite,
     sampling aliases two poles, or a pole is defective.
     """
-    # A Jordan chain of the pole zero has at most two vectors, s and v. They satisfy K s = K v = D v
-    # = C_s v = 0 and C_s s + C_v v = 0. Because M, D and K are symmetric, the uncontrollable
-    # motions are the unobservable motions for C_s = S^T and C_v = 0.
+    # The motions of the pole zero are s + t v, with K s = K v = D v = 0. Such a motion is
+    # unobservable if C_s v = 0 and C_s s + C_v v = 0. With C_s = S^T and C_v = 0, this function
+    # also finds the motions that the input matrix S does not control, because M, D and K are
+    # symmetric.
     if not system.symmetric:
         return None
     starts, margin = system.poles

@@ -15,7 +15,7 @@ from fflin.base.validation import Array, Indices, Values, instance
 from fflin.linear.model import LinearModel
 
 # K or D counts as not symmetric if its relative asymmetry exceeds this. D counts as indefinite if
-# it has eigenvalues of both signs that exceed this fraction of the largest modulus.
+# it has eigenvalues of both signs whose moduli exceed this fraction of the largest modulus.
 _SYMMETRIC = 1e-8
 
 # Largest residual of L2 A = L1 in (9.2) that counts as rounding, relative to the largest entry of
@@ -66,7 +66,10 @@ def rate_matrix(lin: LinearModel) -> Array:
 
 
 def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
-    """Return the inertia of coordinates `kept` if `others` move freely, a Schur complement of M."""
+    """Return the Schur complement of M with respect to the coordinates `others`.
+
+    This matrix is the inertia of the coordinates `kept` if no force acts on the other coordinates.
+    """
     across = M[np.ix_(others, kept)]
     return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
@@ -86,7 +89,7 @@ class SecondOrder:
         return np.sqrt(self.M.diagonal())
 
     def restricted(self, R: Array) -> SecondOrder:
-        """Return the system whose motions are constrained to s = R z by forces that do no work."""
+        """Return the system in the coordinates z, for motions that are constrained to s = R z."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
@@ -133,27 +136,27 @@ class SecondOrder:
 
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
-    # Multiplication by M leaves rounding errors in entries on which no spring, damper or input
-    # acts. Entries below a threshold are therefore set to zero. In units of energy, the threshold
-    # is a fraction of the largest entry of K for springs, and of the largest entry of D for
-    # dampers. For inputs, it is a fraction of the norm of the column of S.
+    # K, D and S are products with M, so rounding errors remain in entries that should be zero.
+    # Entries below a threshold are therefore set to zero. In units of energy, the threshold is a
+    # fraction of the largest entry of the matrix for K and D, and a fraction of the norm of the
+    # column for S.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * ranks.EPS * np.abs(rates)
     if lin.dt:
-        # Every entry of a matrix exponential has the rounding error of its largest entry.
+        # In a matrix exponential, each entry has the rounding error of the largest entry.
         spread[:, : 2 * nv] += 4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
     # In a spin, forces that balance each other leave rounding errors in K and D. If no other forces
-    # act, K and D do not show the size of these errors, so it is estimated from the spin rate.
+    # act, the size of these errors cannot be seen in K and D. It is estimated from the spin rate.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # The norm of each column of S sets the threshold for its entries.
+    # The norm of each column of S sets the threshold for the entries of this column.
     each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
@@ -170,8 +173,7 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     """
     # A continuous model is a second-order system if the rates of the positions depend on the
     # velocities alone. A sampled model without a known continuous model is accepted only if no
-    # force depends on the state, because its matrices then have the structure of a continuous
-    # model.
+    # force depends on the state: (A - I)/dt then has the structure of a continuous model.
     source, nv = lin.generator or lin, len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -196,8 +198,8 @@ class ConservedMomenta:
     A momentum is conserved if no input, spring or damper changes it.
     """
 
-    # W (k, nv): W M nu is conserved. W is in echelon form, so a row for the momentum of a single
-    # coordinate is a unit vector.
+    # W (k, nv) in echelon form, where W M nu are the conserved momenta. If the momentum of a single
+    # coordinate is conserved, its row of W is a unit vector.
     weights: Array
     # L1, L2 (k, nx) with L1 A = 0, L2 A = L1 and L1 B = L2 B = 0. For a sampled model, A is
     # replaced by (A - I)/dt.
@@ -227,7 +229,8 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     size = system.size
     pushes = ranks.stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = ranks.null_space(pushes, 1.0 / size, states=2)
-    # After this, a column of W^T is a unit vector if its momentum belongs to a single coordinate.
+    # The echelon form makes a column of W^T a unit vector if the momentum of a single coordinate is
+    # conserved.
     basis, pivots = ranks.echelon(free, size)
     W = basis.T
     momenta = W @ lin.M
@@ -275,7 +278,8 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
         for i in (0, 1)
     )
     # If the other coordinates are fixed, the inputs cannot move the named coordinate. The inputs
-    # may move it together with the others, so the name states this condition.
+    # may move it together with the others, so its name ends in "with the joints fixed" or "with the
+    # rest fixed".
     of_joint = np.array([group == "qdot_m" for group, _ in rates])
     only_joints = of_joint[conserved.kept].all()
     of_base = not conserved.weights[:, of_joint].any()
@@ -297,7 +301,7 @@ def grouped(names: tuple[str, ...]) -> list[str]:
 
 
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
-    """Format a linear combination by its largest terms; `sizes` makes the weights comparable."""
+    """Format the terms of a linear combination with the largest ``abs(weights) * sizes``."""
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
     largest = abs(weights[order[0]]) * sizes[order[0]]
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
@@ -332,7 +336,7 @@ def undecided(
 def shape(lin: LinearModel, at: Values) -> str:
     """Describe a motion by its largest coordinates.
 
-    `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
+    The vector `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
     """
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]

@@ -167,7 +167,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on missing data, and on modes whose stability rounding error leaves undecided."""
+        """Remarks on missing data, and on modes of undecided stability (due to rounding errors)."""
         notes = [
             f"undecided: the mode at {mode.frequency:.4g} rad/s may grow or decay, because the "
             f"real part of its pole is only {mode.margin:.1g} times the rounding error"
@@ -220,8 +220,9 @@ class Modes:
     def _of_appendages(self) -> list[str]:
         """Return two tables for a robot with flexible appendages, or an empty list.
 
-        The first table compares two frequencies of each mode: with the link that carries the
-        appendage free, and with this link clamped. The second table contains the effective masses.
+        The first table lists two frequencies of each mode: the frequency if the link that carries
+        the appendage is free, and the frequency if this link is clamped. The second table contains
+        the effective masses.
         """
         robot = self.lin._robot
         if robot is None or not robot.modes:
@@ -301,8 +302,9 @@ def modes(lin: LinearModel) -> Modes:
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
-    # If the input forces u0 cancel each other, rounding errors remain in the position derivatives.
-    # Derivatives of this size are set to zero.
+    # If the input forces u0 cancel each other, their rounding errors remain in the derivatives of
+    # the accelerations with respect to the positions. Derivatives that are no larger than these
+    # errors are set to zero.
     A = lin.A.copy()
     by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
@@ -342,7 +344,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 def _percents(energy: Mapping[str, float], room: int) -> str:
-    """List the bodies with at least 1 % of the energy, and add up the energy of the others.
+    """List bodies or joints with at least 1 % of the energy, and the total of all others.
 
     The list is shortened until it fits into `room` characters.
     """
@@ -373,8 +375,8 @@ def energies_of(
     moved = shape[: len(shape) // 2]
     if isinstance(lin, ReducedModel):
         moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
-    # Displacements in base axes replace the velocities: in a mode, all velocities are the
-    # displacements times the pole.
+    # The kinetic energy is computed with displacements, in base axes, instead of velocities. In a
+    # mode, the velocities are the displacements times the pole, so the fractions are the same.
     moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
     kinetic = np.zeros(len(names))
     for part in (moved.real, moved.imag):
@@ -401,8 +403,8 @@ def nonzero_eigenpairs(
     """
     # Rounding moves the k zero eigenvalues of a Jordan block by the k-th root of the rounding
     # error. Zero eigenvalues are therefore removed before the others are computed. The caller
-    # scales A so that its entries are comparable. Singular values up to n times the tolerance count
-    # as zero.
+    # scales A (n, n) so that its entries are comparable. Singular values of at most n * tolerance
+    # count as zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))

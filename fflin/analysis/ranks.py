@@ -12,16 +12,18 @@ from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
-# A coefficient of an echelon form is rounding error if it is below this, relative to its pivot 1.
+# Entries of an echelon form below this count as rounding errors. The pivots are 1, and the rows are
+# weighted to be comparable.
 _CLEAN = 1e-10
 
 # A tolerance is SAFETY times the rounding error. A singular value between LOST and CLEAR times its
 # tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# Forces are compared in units of energy. The threshold of a force is its rounding error, but at
-# least _FLOOR times the largest force of the same kind. A force below the threshold may be rounding
-# error. A force below _ROUNDING times the threshold is set to zero.
+# Forces are entries of a matrix of springs, dampers or inputs, and are compared in units of energy.
+# The threshold of a force is its rounding error, but at least _FLOOR times the largest force in the
+# matrix. A force below the threshold may be a rounding error. A force below _ROUNDING times the
+# threshold is set to zero.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
@@ -54,9 +56,9 @@ class Margin(NamedTuple):
     def transformed(self, change: Array | float, *, halved: bool = False) -> Margin:
         """Return the margin in other coordinates, with transformed singular vectors.
 
-        A singular vector v becomes ``change @ v`` if `change` is a matrix, and otherwise ``change *
-        v``. If `halved`, v is first replaced by its positions or its rates, whichever have the
-        larger norm.
+        A singular vector v becomes ``change @ v`` if `change` is a matrix, and ``change * v`` if it
+        is a vector or a number. If `halved`, v is first replaced by its positions or its rates,
+        whichever have the larger norm.
         """
         moved = []
         for one in self.decisions:
@@ -80,14 +82,14 @@ class FixedPoles(NamedTuple):
     """Poles of the uncontrollable or unobservable part."""
 
     poles: Values = np.zeros(0)  # (k,) [1/s], or discrete-time poles
-    decays: bool = True  # whether all these poles decay, beyond rounding error
+    decays: bool = True  # True if all these poles decay by more than rounding error
     margin: Margin = Margin()  # margin of the rank decisions
     settling: Margin = Margin()  # certainty that the slowest pole decays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RankAnalysis(FrozenArrays):
-    """Fields that `Controllability` and `Observability` share; these classes describe them."""
+    """Common fields of `Controllability` and `Observability`, described in their docstrings."""
 
     dimension: int
     rows: Array
@@ -142,9 +144,9 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 
 
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Set entries that are rounding errors to zero; compare their sizes in units of energy.
+    """Set entries that are rounding errors to zero.
 
-    The unit of entry (i, j) is ``rows[i] * columns[j]``.
+    Entries are compared in units of energy. The unit of entry (i, j) is ``rows[i] * columns[j]``.
     """
     units = rows[:, None] * columns
     size = np.abs(forces.values)
@@ -188,7 +190,7 @@ def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin
 
 
 def null_space(matrix: Noisy, scale: Array | float = 1.0, states: int = 1) -> tuple[Array, Margin]:
-    """Return a basis (n, k) of the null space, and its margin; see `right_vectors`.
+    """Return a basis (n, k) of the null space, and the margin of its dimension.
 
     The basis vectors are ``scale * y`` with orthonormal vectors y (n,).
     """

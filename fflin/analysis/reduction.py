@@ -26,7 +26,8 @@ Part = TypeVar("Part", bound=LinearModel)
 # A value below this fraction of the largest value is rounding error.
 _ROUNDING = 1e-9
 
-# The part of f0 outside the reduced model must be below this fraction of the largest entry of f0.
+# `momentum_reduction` requires that the part of f0 which the reduced states cannot represent is at
+# most this fraction of the largest entry of f0.
 _DRIFT = 1e-9
 
 
@@ -247,7 +248,7 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
 
 
 def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
-    """Return the names of the inputs that are wheels."""
+    """Return the names of the inputs that drive reaction wheels."""
     keys = (key.partition(".") for key in input_keys(lin))
     return tuple(name for group, _, name in keys if group == "wheel")
 
@@ -271,9 +272,10 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # Some combinations of inputs exert no net force at rest but change the wheel speeds. As many
-    # wheels are kept as wheel speeds can be changed independently in this way. By default, wheels
-    # are kept only if inputs other than the wheels can rotate the base.
+    # Some combinations of inputs change the wheel speeds but exert no net force on the rigid
+    # motions of the other bodies. A design can regulate as many wheel speeds as these combinations
+    # can change independently; the other `ignorable_wheels` are removed. By default, all
+    # `ignorable_wheels` are removed unless an input, such as a thruster, exerts an external torque.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -292,9 +294,9 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
     """Return the model of the regulated states, or `lin` itself if it has no wheels."""
-    # The model omits the `removed_wheels`, and the angles of all wheels whose angle affects no
-    # other state. It may therefore have fewer positions than rates. The model also omits each
-    # coordinate of the base position on which no input acts.
+    # The model omits the `removed_wheels`. For every other wheel, it omits the angle if the angle
+    # affects no other state, so the model may have fewer positions than rates. It also omits the
+    # coordinates of the base position on which no input acts, and their rates.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
@@ -325,7 +327,7 @@ def rigid_forces(body: LinearModel) -> Noisy:
 def without(lin: LinearModel, removed: Indices) -> LinearModel:
     """Remove coordinates with the indices `removed` (k,), and their rates, from a model (9.4).
 
-    The result is exact for all values of the removed states, if these do not affect other states.
+    If the removed states do not affect the other states, the result is exact.
     """
     kept = np.setdiff1d(np.arange(len(lin.M)), removed)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
@@ -374,10 +376,10 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
-    """Record the source of a reduced model: the model from which it inherits its certificate.
+    """Record the model from which the reduced model `part` inherits its certificate.
 
-    The source of `part` is the whole model `lin`. If `lin` was sampled from a known continuous
-    model, the source is the part that `make` forms from the continuous model.
+    By default, this is the unreduced model `lin`. If `lin` was sampled from a known continuous
+    model, it is the reduced model that `make` forms from the continuous model.
     """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)

@@ -31,7 +31,7 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of N runs, in order of increasing initial displacement.
+    """Return success statistics of N runs, sorted by increasing initial displacement.
 
     `failed` (N,) is true for each failed run. The statistics are the number of runs before the
     first failure, a lower bound on the success rate at the displacements of these runs, and a

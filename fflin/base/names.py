@@ -18,7 +18,10 @@ def group_of(name: str) -> str:
 
 
 def input_keys(of: Any) -> tuple[str, ...]:
-    """Return the name GROUP.ENTRY of each input; `of` has `input_names` and `input_units`."""
+    """Return the names GROUP.ENTRY of inputs.
+
+    The object `of` has the attributes `input_names` and `input_units`.
+    """
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)
@@ -55,8 +58,8 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """
     if key in names:
         return [names.index(key)]
-    # The pattern must match a whole name, or else the part after its first dot. Only * and ? are
-    # wildcards, because joint names may contain brackets.
+    # If the pattern matches no whole name, it is compared with the part of each name after its
+    # first dot. Only * and ? are wildcards, because joint names may contain brackets.
     pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]

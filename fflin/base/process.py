@@ -11,9 +11,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _PATIENCE = 1.0  # seconds before a bar is shown
-_WORTH = 10.0  # seconds of work from which an estimate is shown
+_WORTH = 10.0  # shortest work [s] for which an estimate is shown
 _INTERVAL = 0.1
-LONG_RUN = 20.0  # seconds of a run after which a faster engine is recommended
+LONG_RUN = 20.0  # duration of a run [s] after which a faster engine is recommended
 
 
 class Progress:
@@ -70,7 +70,7 @@ def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> 
     """Return whether two paths lead to one file or folder; "" means the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
-    except (OSError, ValueError):  # one of them does not exist
+    except (OSError, ValueError):  # one of the paths does not exist
         return False
 
 

@@ -7,7 +7,7 @@ digest, the file was damaged or edited, and is refused. The formats store the di
 - .npz: the entry ``sha256`` is the digest of the other entries;
 - .json: the entry ``sha256`` is the digest of the text before it;
 - .mat: the text of the header contains the digest of everything after this text. The digest is
-  compared before SciPy reads the file, because SciPy can crash on a damaged file.
+  verified before SciPy reads the file, because SciPy can crash on a damaged file.
 
 A file without a digest is read without this check. The result is then not ``verified``, and it is
 saved without a digest.
@@ -59,7 +59,7 @@ def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool)
 def read_record(path: Path) -> tuple[Record, bool]:
     """Return the record of a file, and whether its digest was verified.
 
-    Call it inside `reading`, which converts errors to `FileError`.
+    Call this function inside `reading`, which converts errors to `FileError`.
     """
     # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
     # has no empty matrices.
@@ -78,7 +78,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: No such file{writing.missing(path)}") from None
-    except Exception as error:  # each decoder raises its own types
+    except Exception as error:  # each decoder raises its own types of errors
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
         why = writing.reason(error)
@@ -147,7 +147,7 @@ def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
     # The archive ends with the number of its entries. If a damaged length field hides some entries,
-    # fewer entries are read.
+    # NumPy reads fewer entries than this number.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -253,7 +253,7 @@ class Design(Result):
     verified: bool = field(default=True, kw_only=True)
 
     def __init_subclass__(cls) -> None:
-        # `_value` reads the type of a field from its annotation, which must therefore be text.
+        # `_value` reads the type of a field from its annotation, which must therefore be a string.
         if not all(isinstance(kind, str) for kind in vars(cls).get("__annotations__", {}).values()):
             raise TypeError(f"'{cls.__name__}' needs `from __future__ import annotations`")
 

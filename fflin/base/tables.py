@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fflin.base.validation import Array
 
-MOST_ROWS, _SPARE = 20, 2  # rows of a cut table; _SPARE more rows are not cut
+MOST_ROWS, _SPARE = 20, 2  # rows of a cut table; up to _SPARE more are not cut
 
 _GAP = "  "
 _PARAGRAPH = re.compile(r"\n(?!  \S)")

@@ -36,7 +36,7 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 def is_number(value: object) -> bool:
     """Return whether a TOML value is a finite number."""
     # The limit 1e100 keeps the norm of a vector of such numbers finite. It also excludes integers
-    # that no float can represent.
+    # that are too large for a float.
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100
 
 
@@ -101,8 +101,9 @@ class TomlFile:
     def _named_in(self, message: str, *table: str | int) -> tuple[str | int, ...]:
         """Return the path of the key of `table` to which a message refers.
 
-        A message refers to a key by its name, by its value if this is a string, or by a name that
-        the key matches as a pattern. Return the path of `table` if there is no such key.
+        A message refers to a key if it contains the name of the key, the string value of the key,
+        or a name that the key matches as a pattern. If the message refers to no key, return the
+        path of `table`.
         """
         head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]

@@ -33,7 +33,7 @@ else:
 T = TypeVar("T")
 
 # Largest error of the squared length of a quaternion or (cos, sin) pair that counts as rounding.
-# The quaternion or pair is then renormalised. A larger error counts as wrong input.
+# Up to this error, the quaternion or pair is renormalised. A larger error counts as wrong input.
 NORM_TOLERANCE = 1e-6
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
@@ -130,7 +130,10 @@ def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
 
 
 def untied(key: str, value: object) -> tuple[object, bool]:
-    """Return the range in `value`, and whether names that match `key` share one random value."""
+    """Return a range, and whether all names that match `key` share one random value.
+
+    The argument `value` is the range itself, or a mapping {"range": range, "tied": bool}.
+    """
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
@@ -139,7 +142,7 @@ def untied(key: str, value: object) -> tuple[object, bool]:
 
 
 def numbers(name: str, value: object, of_what: str, each: str) -> dict[str, float]:
-    """Return {name: finite float} from a mapping; messages call an entry `each`."""
+    """Return {name: finite float} from a mapping; `each` is the noun for an entry in messages."""
     values = by_name(name, value, of_what)
     return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 

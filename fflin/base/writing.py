@@ -20,7 +20,8 @@ from pathlib import Path
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
 
-# In a folder with at least this many names, no similar names are searched for.
+# If a file is missing, similar names are suggested only if its folder contains fewer names than
+# this.
 _MANY = 1000
 
 
@@ -191,7 +192,7 @@ def check_distinct(*targets: Path | None) -> None:
 
 
 def missing(path: Path, otherwise: str = "") -> str:
-    """Describe where a file is missing: give its folder, and similar names in this folder."""
+    """Return the end of a message on a missing file: its folder, and similar names there."""
     import difflib
 
     try:

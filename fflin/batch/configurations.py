@@ -261,9 +261,9 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
 
 
 def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
-    """Check configurations of a robot, and return them: a new array, or points generated on demand.
+    """Return checked configurations of a robot: a new array, a grid or random configurations.
 
-    The array (N, nq) contains corrected rows, which satisfy `Robot.checked_configuration`.
+    The rows of the array (N, nq) are corrected so that they satisfy `Robot.checked_configuration`.
     """
     if isinstance(q, Grid | RandomConfigurations):
         # The points may be made for a robot with other inputs or outputs, but its joints must be
@@ -304,10 +304,11 @@ def checked_rows(
     *,
     every: bool = False,
 ) -> Array:
-    """Return read-only rows (count, size), given as such an array or as one row for all points.
+    """Return a read-only array (count, size) with one row for each point.
 
-    The function `check` must raise an error for an invalid row. It is called for each row with an
-    entry that is not finite, or for all rows if `every` is true.
+    The argument `given` is such an array, or a single row (size,) for all points. The function
+    `check` must raise an error for an invalid row. It is called for a single row. For an array, it
+    is called for each row with an entry that is not finite, or for all rows if `every` is true.
     """
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))

@@ -47,8 +47,8 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 def frame_of(robot: Robot, frame: object) -> Frame:
     """Return the frame, or the default frame of the robot if `frame` is None.
 
-    Raise `InputError` for an unknown frame, for an orbital frame without an orbit, and for any
-    other frame in orbit.
+    Raise `InputError` if the frame is unknown. Also raise it if the frame is orbital but the robot
+    is not in orbit, or if the robot is in orbit but the frame is not orbital.
     """
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
@@ -84,7 +84,7 @@ class Groups(NamedTuple):
 
 
 def _axes_of(**units: str) -> dict[str, str]:
-    """Return {component: unit} for the x, y and z components of the vectors in {vector: unit}."""
+    """Return {component: unit} of all x, y and z components, from `units` {vector: unit}."""
     return {f"{name}.{axis}": unit for name, unit in units.items() for axis in "xyz"}
 
 
@@ -165,31 +165,34 @@ class Chart:
         return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
 
     def over_q_b(self, by_turn: Array) -> Array:
-        """Convert derivatives (.., k, 3) from d theta to q_b as the independent variable.
+        """Return derivatives (.., k, 3) with respect to q_b.
 
-        d theta is a small rotation of the base in base axes (1.3).
+        `by_turn` (.., k, 3) contains the derivatives with respect to d theta, a small rotation of
+        the base in base axes (1.3).
         """
         return 2.0 * by_turn if self.standing else product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
-        """Multiply some blocks of x (.., m, k) by R from the left, in place.
+        """Multiply blocks of three rows of x (.., m, k) by R from the left, in place.
 
-        `parts` are the slices of the three rows of each block. To multiply blocks of three columns
-        by R^T from the right, callers pass the transpose of the matrix.
+        `parts` has one slice of three rows for each block. To multiply blocks of three columns of a
+        matrix by R^T from the right, pass the transpose of this matrix as x.
         """
         _turn(self.R, () if self.standing else parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) after conversion of the rows of `parts` to reference axes.
+        """Return x (.., m, k) with some rows converted from base axes to reference axes.
 
-        Each part has three rows, which are in base axes in the given x.
+        Each slice in `parts` selects three rows of x: the components of k vectors. The given array
+        is not changed.
         """
         return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) after conversion of the rows of `parts` to base axes.
+        """Return x (.., m, k) with some rows converted from reference axes to base axes.
 
-        Each part has three rows, which are in reference axes in the given x.
+        Each slice in `parts` selects three rows of x: the components of k vectors. The given array
+        is not changed.
         """
         return x if self.standing or not parts else _turn(self.R.mT, parts, x.copy("K"))
 
@@ -218,9 +221,9 @@ _TURN = 2.0 * np.pi
 
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
-    """Return the states (.., nx) at q (.., nq) and at nu (.., 6 + n) in base axes.
+    """Return the states (.., nx) at configurations q (.., nq) and velocities nu (.., 6 + n).
 
-    The arguments are not checked.
+    nu is in base axes. The arguments are not checked.
     """
     return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
 
@@ -228,8 +231,8 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
 def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
     """Remove full turns of continuous joints from states or state errors x (.., nx), in place.
 
-    Afterwards, the angle of each continuous joint is within half a turn of its value in `near`
-    (nx,). If `near` is a number, it is the value for all joints. Return x.
+    Afterwards, the angle of each continuous joint is within half a turn of the entry of the state
+    `near` (nx,) for this joint, or of the angle `near` if it is a number. Return x.
     """
     joints = 6 + state.unbounded
     apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]
@@ -298,7 +301,7 @@ def state_history(
     The first angles are within half a turn of `near` (nx,), or of 0 if `near` is None.
     """
     # If the times t (N,) are given, the joint rates determine how many turns a joint makes from one
-    # row to the next. Otherwise, the angle is assumed to change by less than half a turn.
+    # row to the next. Without times, each angle is assumed to change by less than half a turn.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -338,9 +341,9 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
 def moving_errors(frame: str, x: Array, target: Array) -> Array:
     """Return the errors (N, nx) of states x (N, nx) from moving targets (5.1).
 
-    Each target (nx,) is a state, whose base axes are the target axes. Attitude and position errors
-    are in target axes. A velocity error is the velocity of the state in its own base axes minus the
-    velocity of the target in target axes.
+    Each target (nx,) is a state, and its base axes are the target axes. Attitude and position
+    errors are in target axes. The error of a base velocity is the velocity of the state in the base
+    axes of this state, minus the velocity of the target in target axes.
     """
     e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
     turned, scalar = _apart(x, target)
@@ -354,8 +357,8 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
 def moved_by(frame: str, target: Array, e: Array) -> Array:
     """Return the states (N, nx) whose errors from targets (N, nx) are e (N, nx).
 
-    This function is the inverse of `moving_errors`. If an error has |q_b| > 1, the attitude in its
-    row is NaN.
+    This function is the inverse of `moving_errors`. If an error has |q_b| > 1, the returned state
+    has the attitude NaN, and its base velocities in reference axes are NaN too.
     """
     x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
@@ -377,7 +380,10 @@ def _turned(x: Array) -> tuple[Array, Array]:
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the state indices (3,) of each base velocity that is in reference axes in `frame`."""
+    """Return the state indices (3,) of each base velocity that is in reference axes.
+
+    The frame named `frame` determines the axes of omega_b and v_b.
+    """
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -1,4 +1,4 @@
-"""Impacts: instant changes of a robot by a grasp or a jammed joint, and the velocities after."""
+"""Impacts: sudden changes of a robot by a grasp or a jammed joint, and the new velocities."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -153,11 +153,12 @@ def jam(
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> Impact:
-    """Return the impact after which `parts` (robot, q, v) move together as the robot `whole`.
+    """Return the impact that turns the robots in `parts` into the robot `whole`.
 
-    The velocity just after the impact solves (13.1). For each part, the `impulse` of the result
-    contains M (v_before - v_after) in Pinocchio's order, which is minus the generalised impulse on
-    the part. In `whole`, the names of the second part begin with `prefix`.
+    Each part is (robot, q, v), with q and v just before the impact. The velocity just after the
+    impact solves (13.1). For each part, the `impulse` of the result contains the vector
+    M (v_before - v_after) in Pinocchio's order, which is minus the generalised impulse on the part.
+    In `whole`, the joint names of the second part begin with `prefix`.
     """
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
@@ -372,8 +373,8 @@ def capture(
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
     """Return the checked configuration and velocity of a payload, with its base placed at `at`.
 
-    `at` is a placement in the world. If q is None, the joints are neutral. If v is None, the
-    payload is at rest. If v is a twist (6,), the joints are at rest.
+    `at` is a placement in the world. If q is None, the joints are at their neutral positions. If v
+    is None, the payload is at rest. If v is a twist (6,), the joints are at rest.
     """
     configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
     root = other.model.jointPlacements[ROOT]

@@ -17,7 +17,7 @@ _integrate = pin.integrate
 
 
 def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
-    """Return the configurations (N, nq) displaced by the tangent vectors `way` (N, nv)."""
+    """Return configurations q (N, nq) after displacements by the tangent vectors `way` (N, nv)."""
     return np.array([*map(partial(_integrate, model), q, way)])
 
 
@@ -36,11 +36,11 @@ class Integrator:
     moments: ClassVar[tuple[float, ...]]
     # Stability limit: a negative real pole is integrated stably up to this value of h |pole|.
     reach: ClassVar[float]
-    # After each stage, a displacement leads to the next configuration. The displacement starts from
-    # the configuration of the stage with this index: 0 for the first stage, 1 for the second.
+    # After each stage, a displacement leads to the next configuration. For each displacement, this
+    # is the index of the stage whose configuration it starts from. The first stage has the index 0.
     origins: ClassVar[tuple[int, ...]]
-    # Weights of h v, h^2 l1, h^2 l2, ... in each displacement. The last displacement starts from
-    # the result of the displacement before it.
+    # Weights of h v, h^2 l1, h^2 l2, ... in each displacement. The last displacement has no
+    # entry in `origins`, because it starts from the result of the displacement before it.
     displacements: ClassVar[tuple[tuple[float, ...], ...]]
     # Weights of v, h l1, h l2, ... in the velocity after each stage.
     speeds: ClassVar[tuple[tuple[float, ...], ...]]
@@ -57,7 +57,7 @@ class Integrator:
         """Return the weights of v, l1, l2, ... for a step of dt [s].
 
         The first result has one row of weights for each displacement of q. The second result has
-        one row for each new velocity.
+        one row for the velocity after each stage.
         """
         displacement, speed = np.array(cls.displacements), np.array(cls.speeds)
         displacement[:, 0] *= dt
@@ -157,7 +157,7 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
 def held_derivatives(
     A: Array, driven: Array, h: float, dA: Array, d_driven: Array
 ) -> tuple[Array, Array]:
-    """Return the changes of both results of `held_exponential`, to first order.
+    """Return the first-order changes of the two matrices that `held_exponential` returns.
 
     dA (.., n, n) is the change of A, and d_driven (.., n, k) is the change of `driven`.
     """
@@ -174,8 +174,8 @@ def held_derivatives(
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     """Return the integral of e^(F^T t) W e^(F t) over [0, h]; F and h may have leading axes."""
-    # W is a block of the matrix below, whose exponential is computed. The rounding errors of all
-    # blocks of an exponential are relative to its largest block. So W is scaled to the size of F.
+    # The exponential of the matrix `block` is computed, which contains W and F. Its rounding errors
+    # are relative to the largest block of the matrix. So W is scaled to the norm of F.
     from scipy.linalg import expm
 
     h, n = np.asarray(h)[..., None, None], F.shape[-1]

@@ -151,8 +151,8 @@ class OrbitField:
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and the inertial v for the same robot with its base at the frame's origin.
 
-        The linear velocity of the base is zero in the result. Position and linear velocity of the
-        base do not affect the motion of the robot relative to the free fall of the base's origin.
+        The linear velocity of the base is zero in the result. The position and the linear velocity
+        of the base do not change the accelerations c in (14.2).
         """
         q, v = q.copy(), self.absolute(q, v)
         q[:3] = v[PIN_LINEAR] = 0.0
@@ -161,15 +161,15 @@ class OrbitField:
     def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
         """Convert derivatives of inertial accelerations to derivatives of relative accelerations.
 
-        The given `by_q` and `by_v` hold at the point that `near` returns for q and v. They are
-        changed in place to the derivatives of (14.2) at q and v.
+        The given `by_q` and `by_v` are the derivatives at the point that `near` returns for q and
+        v. They are changed in place to the derivatives of (14.2) at q and v.
         """
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # The next lines differentiate the relative accelerations (14.2). With the inertial
-        # acceleration (c_w, c_v) at `near`, they are c_w + w x spin and
-        # c_v + fall - 2 spin x v - w x v.
+        # The next lines differentiate the relative accelerations (14.2), which are c_w + w x spin
+        # and c_v + fall - 2 spin x v - w x v. Here (c_w, c_v) is the inertial acceleration at the
+        # point of `near`, and w and v are the velocities of the base relative to the frame.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -182,10 +182,11 @@ class OrbitField:
     def potential(self, data: pin.Data) -> float:
         """Return the potential energy [J] in the orbital frame, without the energy of springs.
 
-        It is the sum of the integral and of the term of wheels with a constant momentum in (14.3).
+        It is the sum of two terms of (14.3): the integral over the mass of the robot, and the sum
+        over the wheels with a constant momentum.
         """
-        # Without these wheels, the potential energy is -1/2 times the integral of x^T G x over the
-        # mass of the robot. The matrix G of this function is `pull`, which is K in (14.3).
+        # The integral term is -1/2 times the integral of x^T K x. The matrix K of (14.3) is `pull`,
+        # and is named G in the next lines.
         R, center = self._bodies(data)
         G, inertia = self.pull, self._inertia
         second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
@@ -225,7 +226,7 @@ class GravityGradient(NamedTuple):
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
-        """Return the field at the base pose of a configuration (nq,); `require_near` checks it."""
+        """Return the field at the base pose of q (nq,), which `require_near` checks first."""
         field.require_near(q)
         R, position = field.base(q)
         n = mean_motion(field.robot)
@@ -235,9 +236,10 @@ class GravityGradient(NamedTuple):
     def force(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array, Array]:
         """Return the generalised force P (nv,) of the field at q, with its derivatives (14.4).
 
-        The base of q must be at the origin, so that P excludes the free fall of the base's origin.
-        The first derivatives (nv, nv) are with respect to q, with the field constant in base axes.
-        The others (nv, 3) are with respect to rotations of the base.
+        In q, the base must be at the origin, so that P excludes the free fall of the base's origin.
+        The second result (nv, nv) contains the derivatives with respect to q, for a field that is
+        constant in base axes. The third result (nv, 3) contains the derivatives with respect to
+        rotations of the base.
         """
         total, v, at_rest = np.zeros((3, model.nv))
         by_q, by_turn = np.zeros((model.nv, model.nv)), np.zeros((model.nv, 3))

@@ -23,7 +23,7 @@ _LOCAL = pin.ReferenceFrame.LOCAL
 class Sensed(NamedTuple):
     """Outputs y (ny,) and their derivatives (ny, nv) at a point.
 
-    The rows of outputs that are states are zero. `Sensing.states` lists these rows.
+    Some outputs are states. `Sensing.states` lists their rows, which are zero here.
     """
 
     y: Array
@@ -139,8 +139,8 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    # The first term of the velocity is computed in the axes of the frame, and v_b in base axes. The
-    # skew terms are the derivatives with respect to rotations of these axes.
+    # The velocity is the sum of two terms. The first is rotated from the axes of the frame, and the
+    # second, v_b, from base axes. The skew terms are the derivatives of these two rotations.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
@@ -219,8 +219,8 @@ class Sensing:
 
     # Motion relative to the base does not depend on the base's position and linear velocity
     # (Galilean invariance). So Pinocchio evaluates the robot with its base at the origin and
-    # v_b = 0, and the motion of the base is added afterwards. Without this, digits would be lost at
-    # orbital positions and velocities.
+    # v_b = 0, and the motion of the base is added afterwards. If Pinocchio used the actual position
+    # and velocity of a base in orbit, digits would be lost.
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
@@ -304,8 +304,8 @@ class Sensing:
 class Measuring:
     """Outputs y computed by kinematics without derivatives, to check C and D.
 
-    The orientation output of a frame is the rotation vector from its attitude at the configuration
-    q to its current attitude.
+    The orientation output of a frame is the rotation vector from its attitude at the operating
+    point to its current attitude. The argument q is the configuration at the operating point.
     """
 
     def __init__(self, state: StateMap, q: Array) -> None:

@@ -82,7 +82,7 @@ def base_of(state: Mapping[str, Any]) -> pin.SE3:
 
 
 def combined(state: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two mappings as in `base_of`; entries of `other` replace entries of `state`.
+    """Merge two mappings such as `robot.point`; entries of `other` replace entries of `state`.
 
     In "joints" and "velocity", only the joints and rates that `other` names are replaced.
     """

@@ -26,8 +26,8 @@ from fflin.robot.mass_properties import coordinate_names
 _EPS = float(np.finfo(float).eps)
 WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
-# Pinocchio's articulated-body inverse sums inertias about the base's origin. If `inertia_bounds`
-# replace M_ii, the couplings also bound the rounding errors of this inverse. If the sum of these
+# Pinocchio's articulated-body inverse sums inertias about the base's origin. To bound its rounding
+# errors, the couplings are computed with `inertia_bounds` in place of M_ii. If the sum of these
 # couplings exceeds the following limit, M^-1 is computed by a Cholesky factor of M instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
@@ -145,9 +145,11 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     The moments of inertia are about the base's origin. Return None if a joint is neither revolute
     nor prismatic.
     """
-    # About the base's origin, the moment of inertia of a body is at most its largest principal
-    # moment plus its mass times the squared length of a path. The path leads from joint to joint to
-    # the body's centre of mass, and includes a displacement of `STROKE` at each prismatic joint.
+    # By the parallel axis theorem, the moment of inertia of a body about the base's origin is at
+    # most its largest principal moment plus m r^2. Here m is the mass of the body, and r is the
+    # distance of its centre of mass from the base's origin. This distance is at most the length of
+    # the path from joint to joint to the centre of mass, with a displacement of `STROKE` at each
+    # prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
     if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
@@ -181,8 +183,8 @@ class AccelerationDerivatives(NamedTuple):
     """
 
     c: Array  # (.., 6 + n): without gravity and omega_b x v_b, see (3.2)
-    # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state. Both are in
-    # base axes.
+    # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state. The
+    # displacements are in base axes.
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
     gravity: Array  # (.., 3) in base axes
@@ -216,10 +218,11 @@ class Accelerations:
         self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
-        # `rows` contains the derivatives at constant c of M c + b - B_u u minus the forces of
-        # springs and dampers. They are stored transposed, with one row for each coordinate of a
-        # displacement of the state, so that their parts are contiguous. The first six rows are for
-        # the attitude and position of the base. They are zero without an orbit.
+        # `rows` contains the derivatives, at constant c, of M c + b - B_u u minus the forces of
+        # springs and dampers. Each row contains the derivative with respect to one coordinate of a
+        # displacement of the state, so the rows for q_m and nu are contiguous. The first three rows
+        # are for the attitude of the base, and are zero without an orbit. The next three rows are
+        # for its position, and are always zero.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
         self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
@@ -235,17 +238,18 @@ class Accelerations:
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
     ) -> AccelerationDerivatives:
-        """Return the accelerations c and their derivatives at q, v and u in base axes.
+        """Return the accelerations c and their derivatives in base axes, at q, v and u.
 
-        `nu` is v in state order. The C-contiguous arrays `slopes` and `by_u` receive the
-        derivatives, and the result refers to these arrays.
+        u is in base axes too, and `nu` is v in state order. The derivatives are written to the
+        C-contiguous arrays `slopes` and `by_u`, and the result refers to these arrays.
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # Here, the base is in its neutral pose and has no linear velocity, because c does not
-        # depend on its pose and linear velocity. Large values would make Pinocchio's derivatives
-        # less accurate. Gravity is zero as well, because uniform gravity accelerates all parts of
-        # the robot alike (equivalence principle).
+        # Here, the base is in its neutral pose and has no linear velocity, because large values
+        # would make Pinocchio's derivatives less accurate. Without an orbit, c does not depend on
+        # the pose and linear velocity of the base. In orbit, c depends on the attitude only through
+        # `tide`. Gravity is zero as well, because uniform gravity accelerates all parts of the
+        # robot alike (equivalence principle).
         q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:

@@ -335,7 +335,7 @@ class StateMap:
         return matrix.take(self._flat, out=out, mode="clip")
 
     def project_transposed(self, matrix: Array, out: Array) -> None:
-        """Write the last rows of ``(S.T @ matrix @ S).T`` into a C-contiguous array (.., 6 + n)."""
+        """Write the last k rows of ``(S.T @ matrix @ S).T`` to a C-contiguous array (k, 6 + n)."""
         if self.S is None:
             matrix.take(self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip")
         else:
@@ -433,9 +433,9 @@ class Actuation:
         # Whether the inputs are tau_b, F_b and all joint torques in state order, so that B_u is the
         # identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
-        # (joint, indices, wrenches) for each joint on which thrusters, or wheels without a joint of
-        # their own, are mounted. The indices are of these k inputs, and the wrenches (6, k) of unit
-        # inputs are in the frame of the joint.
+        # (joint, indices, wrenches) for each joint in `carried`. The indices (k,) are the positions
+        # in u of the k inputs that are mounted on the joint. The wrenches (6, k) of unit inputs are
+        # in the frame of the joint.
         self.wrench_columns: list[tuple[int, Indices, Array]] = []
         self._of_carried: list[int] = []
         for joint, items in carried.items():
@@ -466,8 +466,8 @@ class Actuation:
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrenches of thrusters and wheels on all joints, in the frames of the joints.
 
-        Wheels with a joint of their own are not included. The result is None if the robot has no
-        other wheels and no thrusters.
+        Wheels are included only if they are modelled without a joint of their own. The result is
+        None if the robot has neither such wheels nor thrusters.
         """
         if not self.carried:
             return None
@@ -478,5 +478,8 @@ class Actuation:
 
 
 def selection(names: Sequence[str], of: Sequence[str]) -> Array:
-    """Return the matrix S (k, n) that selects the entries `names` of a vector with names `of`."""
+    """Return the matrix S (k, n) that selects k of the n entries of a vector by their names.
+
+    `names` lists the names of the selected entries, and `of` lists the names of all entries.
+    """
     return np.eye(len(of))[[*map(of.index, names)]]

@@ -1,9 +1,9 @@
 """Control allocation: convert the commands of one set of inputs to another set with limits.
 
 The allocated inputs minimise the error of the accelerations within the limits. An active set method
-solves this bounded least squares problem. It starts with all inputs at zero, or at the nearest
-bound. The problem is strictly convex, so the solution does not depend on the order in which inputs
-reach their bounds.
+solves this bounded least squares problem. It starts with all inputs at zero. If the bounds of an
+input exclude zero, this input starts at the bound nearest to zero. The problem is strictly convex,
+so the solution does not depend on the order in which inputs reach their bounds.
 
 References
 ----------
@@ -30,18 +30,19 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 class LeastSquares(
     namedtuple("LeastSquares", "least most columns A Q R b y wanted x s low high state order")
 ):
-    """Problem: find inputs x (k,) within bounds whose force is nearest to a given force (size,).
+    """Problem: find bounded inputs x (k,) whose force is as near as possible to a given force.
 
     - `least`, `most` (k,): the bounds of x.
-    - `columns`: k + 1 vectors (size,), one after the other. The first k are the forces of unit
-      inputs. The last is the given force.
+    - `columns`: k + 1 force vectors (size,), one after the other. The first k are the forces of
+      unit inputs. The last is the given force.
 
     The other fields are work space:
 
     - `A`: the vectors of `columns` for one lane. The first k are divided by the norm of the matrix
       that they form.
-    - `Q`, `R`: QR factors of a matrix with one column for each free input. A column contains the
-      force of this input from `A`, and then k entries: `LEAST` for this input and zeros.
+    - `Q`, `R`: QR factors of a matrix with one column (size + k,) for each free input. A column
+      contains the force of its input from `A`, and then one entry for each of the k inputs. This
+      entry is `LEAST` for the input of the column, and 0 for the other inputs.
     - `order`: the free inputs, in the order in which they became free.
     - `b`: the residual. `y`: the components of the residual along the vectors of `Q`.
     - `wanted`: the given force, scaled to length 1.
@@ -73,7 +74,7 @@ def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> flo
 
 @vec.compiled_as(_row_product)
 def row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
-    """Return the scalar product of two vectors (count,): a from `first` on, and b from `second`."""
+    """Return the scalar product of a[first : first + count] and b[second : second + count]."""
     return a[first : first + count].dot(b[second : second + count])
 
 
@@ -84,7 +85,7 @@ def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: i
 
 @vec.compiled_as(_add_row)
 def add_row(a: Array, first: int, factor: float, b: Array, second: int, count: int) -> None:
-    """Add `factor` times `count` entries of b from `second` on to the entries of a from `first`."""
+    """Add `factor` times b[second : second + count] to a[first : first + count], in place."""
     a[first : first + count] += factor * b[second : second + count]
 
 
@@ -95,7 +96,7 @@ def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 @vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    """Write to `out` the scalar product of each row (size,) of a and the entries b[:size]."""
+    """Write the scalar product of b[:size] with each row (size,) of a to `out`."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
@@ -190,7 +191,7 @@ def allocate(allocation, point, commanded):
 
 
 def _write_force(work, robot, point, columns, at):
-    """Write the generalised force of the inputs `point.pushing` to `columns` from `at` on.
+    """Write the generalised force of the inputs `point.pushing` to `columns`, from index `at` on.
 
     The inputs are converted to base axes in place.
     """
@@ -201,7 +202,7 @@ def _write_force(work, robot, point, columns, at):
 
 @called
 def solve(problem, size, lane):
-    """Write the solution for one lane to `problem.x`; it is NaN if the force is NaN."""
+    """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count = problem.least, problem.most, len(problem.least)
     write_scaled(problem.columns, lane, 1.0, A)
@@ -223,8 +224,8 @@ def solve(problem, size, lane):
         write_scaled(A[last:], 0, 1.0 / force, wanted)
         write_scaled(A, 0, 1.0 / unit, A)
         free, kept = _solve_scaled(problem, size, free, 0)
-        # Keep only the part of the force that the inputs produce. The rounding errors of the other
-        # part would be larger than the terms with LEAST.
+        # Replace the wanted force by the force that the inputs x produce. The difference between
+        # these forces would cause rounding errors larger than the terms with LEAST.
         wanted[:] = 0.0
         for j in range(count):
             if x[j] != 0.0:
@@ -293,7 +294,7 @@ def _fit(problem, size, free, kept):
     s, x, Q, R, b, y = problem.s, problem.x, problem.Q, problem.R, problem.b, problem.y
     order, A, count = problem.order, problem.A, len(problem.s)
     rows = size + count
-    # Write the residual without the free inputs: `wanted` minus the force of all inputs that are at
+    # Write the residual for free inputs at zero: `wanted` minus the force of all inputs that are at
     # their bounds.
     b[:] = 0.0
     write_scaled(problem.wanted, 0, 1.0, b[:size])
@@ -322,9 +323,10 @@ def _fit(problem, size, free, kept):
 
 @called
 def _steepest(problem, size):
-    """Return the input at a bound whose release reduces the cost fastest; -1 if there is none.
+    """Return the index of the input whose release from its bound reduces the cost fastest.
 
-    Inputs that were tried and could not leave their bounds are excluded.
+    Inputs that were tried and could not leave their bounds are excluded. If no release reduces the
+    cost, return -1.
     """
     best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
     row_products(problem.A[: len(state) * size], size, b, slopes)
@@ -339,9 +341,9 @@ def _steepest(problem, size):
 
 
 def nearest(A, b, least, most):
-    """Return the u (k,) for which A u is nearest to b, within the bounds `least` and `most` (k,).
+    """Return the u (k,) within the bounds `least` and `most` (k,) for which A u is nearest to b.
 
-    If several u are equally near, the smallest u is returned.
+    If several u are equally good, the u with the smallest norm is returned.
     """
     numbers, size = [0.0] * len(least), len(b)
     # Reading an entry is faster for lists than for arrays, so lists replace the work arrays.

@@ -3,8 +3,9 @@
 All vectors are in base axes, so no vector is rotated from joint to joint. Moments and inertias of a
 body are about its joint. If they were about the base's origin, the inertia of a light tool on a
 long arm would lose digits. Row i of the packed M holds the nonzero entries of this row up to the
-diagonal. Their column indices are the coordinates on the path from the base to coordinate i. The
-path to any of these coordinates is the first part of the path to i.
+diagonal. Their column indices are the coordinates on the path from the base to coordinate i. If
+coordinate j is on this path, the path to j is the beginning of the path to i. So the column indices
+of row j are also the first column indices of row i.
 
 References
 ----------
@@ -41,7 +42,10 @@ def _inertia(work, at, place, bodies, first):
 
 
 def spatial_inertia_times(work, at, motion):
-    """Return the product (moment, force) of the spatial inertia at `at` and a motion vector."""
+    """Return the product (moment, force) of a spatial inertia and a motion vector.
+
+    The spatial inertia begins at work[at].
+    """
     m, h = load(work, at), vec.get3(work, at + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
     w, v = motion
@@ -133,7 +137,7 @@ def inwards(work, tree):
 def factorise(work, tree):
     """Factorise the packed M = L^T D L: replace M by the unit lower triangular L.
 
-    The entries of 1 / D are written at `scaled`, in the places of the diagonal.
+    In the array at `scaled`, which is packed in the same way, 1 / D is written to the diagonal.
     """
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
@@ -221,7 +225,7 @@ def joint_axis(work, tree, body):
 def motion_cross(velocity, along):
     """Return the spatial cross product `velocity` x `along`.
 
-    It is the time derivative of a motion vector `along` that is fixed in a body with this velocity.
+    If `along` is fixed in a body with this velocity, the result is the time derivative of `along`.
     """
     w, v = velocity
     return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
@@ -230,7 +234,7 @@ def motion_cross(velocity, along):
 def at_joint(work, at, place):
     """Return a motion vector of the parent, shifted from the parent's origin to the joint's origin.
 
-    `at` is the offset of the motion vector, and `place` is the offset of the joint's pose.
+    The motion vector begins at work[at], and the pose of the joint begins at work[place].
     """
     w, v = vec.get6(work, at)
     return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))

@@ -93,7 +93,8 @@ def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
 def kernel(module: str, name: str) -> Compiled:
     """Return a compiled function of the kernel.
 
-    Its first call compiles it and stores the machine code on disk, or loads the stored code.
+    The first call of the returned function compiles it and stores the machine code on disk. If the
+    disk already has the machine code, the first call loads it.
     """
     with _TURN:  # several threads may call this function at the same time
         return _prepared(module, name)
@@ -111,7 +112,7 @@ def _prepared(module: str, name: str) -> Compiled:
             entry.unlink(missing_ok=True)
 
     def compile_alone(signature: object) -> object:
-        """Compile for a signature, or load the code that another process has stored meanwhile."""
+        """Compile the function for a signature, or load code that another process has stored."""
         # A thread of this process must not wait for a file lock that another of its threads holds.
         # So `_COMPILING` admits only one thread at a time.
         with _COMPILING, _between_processes(lock):
@@ -157,7 +158,7 @@ def _between_processes(path: Path) -> ExitStack:
     function.
     """
     held = ExitStack()
-    # `Timeout` is an OSError. So if the second wait ends without a lock, this is suppressed too.
+    # `Timeout` is an OSError. So the `Timeout` of the second wait is suppressed, too.
     with suppress(ImportError, OSError, NotImplementedError):
         from filelock import FileLock, Timeout
 
@@ -186,8 +187,9 @@ def _stored(folder: Path, module: str, name: str) -> tuple[list[Path], list[Path
     The first list has the files that are newer than all sources of the kernel. The second list has
     the older files.
     """
-    # The machine code also contains called functions of other source files. numba compares its age
-    # only with the source file of the function itself, so all source files are compared here.
+    # The machine code of a function also contains the functions that it calls from other source
+    # files. numba compares the age of the code only with the source file of the function itself. So
+    # all source files are compared here.
     source = max(file.stat().st_mtime for file in Path(__file__).parent.glob("*.py"))
     newer: list[Path] = []
     older: list[Path] = []

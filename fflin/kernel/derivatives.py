@@ -66,7 +66,8 @@ def _coriolis_transposed(work, at, along):
 def differentiate(work, tree):
     """Write the derivatives of M c + b - B_u u minus spring and damper forces, at constant c.
 
-    The matrix (6 + n, 12 + 2 n) has one column for each displacement of the state in base axes.
+    The matrix (6 + n, 12 + 2 n) has one column for each coordinate of a displacement of the state,
+    in base axes.
     """
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
@@ -124,9 +125,10 @@ def differentiate(work, tree):
 
 
 def _push(work, tree, by_u):
-    """Write D_u (3.3), the acceleration c per unit of each input.
+    """Write D_u (3.3), whose columns are the accelerations c per unit of each input.
 
-    It is a column of M^-1, or M^-1 times a column of B_u for a body-fixed input.
+    The column of a body-fixed input is M^-1 times the column of B_u. The column of any other input
+    is a column of M^-1.
     """
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
     for row in range(size):
@@ -194,8 +196,8 @@ def derive(tree, points, out, lanes, work):
     inputs = slopes + size * 2 * size
     coupling = inputs + size * len(tree.driven)
     for block in range(0, len(q), LANES):
-        # The last block begins earlier if fewer than eight points are left. So it fills all lanes,
-        # and computes some points of the block before again.
+        # If fewer than eight points are left, the last block begins earlier so that it fills all
+        # lanes. Some points of the previous block are then computed twice.
         first = min(block, len(q) - LANES)
         _pack(q, first, lanes.q)
         bodies.outwards(work, tree, lanes.q)

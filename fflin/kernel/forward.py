@@ -1,8 +1,8 @@
 r"""Forward dynamics of a robot with its inputs, springs and gravity, and its first integrals.
 
 The accelerations c solve (3.1), with M from the composite rigid body algorithm and the bias from
-RNEA. All vectors in this computation are in base axes. It does not use the position and the linear
-velocity of the base, because c does not depend on them. Momentum and centre of mass follow from the
+RNEA. The computation of c is in base axes, and does not use the position or the linear velocity of
+the base, because c does not depend on them. Momentum and centre of mass follow from the
 external wrench W by (11.2) of docs/derivation.md, as in `simulation.run`:
 
 .. math:: H(t) = H(0) + \int W\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
@@ -33,15 +33,13 @@ class Mechanics(
     - `tree`: the kinematic tree.
     - `gravity` (3,): gravity in world axes [m/s^2].
     - `index`: for each joint, the index of its first entry in q.
-    - `circling`: for each joint, whether this entry is the cosine of its angle.
+    - `circling`: for each joint, whether this entry is the cosine of the joint angle.
     - `scale`: for each joint, the change of this entry per unit of q_m. It is 1 except for modal
       amplitudes.
     - `springy`: for each joint, whether it has a spring or a damper.
     - `rest`: for each joint, the position at which its spring exerts no force.
-    - `held`: for each torque or force on the base in reference axes, the index of the first of its
-      three inputs.
-    - `triads`: for each torque or force on the base in any axes, the index of the first of its
-      three inputs.
+    - `triads`: for each torque or force on the base, the index of the first of its three inputs.
+    - `held`: the entries of `triads` for the torques and forces that are in reference axes.
     - `origin` (7,): placement of the world relative to the reference, as position and quaternion.
     - `faults`: the `ActuatorFaults`.
     """
@@ -50,9 +48,9 @@ class Mechanics(
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """Actuator faults: a command u produces the inputs gain u + bias (nu,).
 
-    Each input is 0 from the time `until` [s] on. For each torque or force on the base, `turn` holds
-    the three columns (9,) of a matrix. They are the directions in which the three inputs of this
-    vector actually act.
+    Each input is 0 from the time `until` [s] on. For each torque or force on the base, `turn`
+    contains the three columns (9,) of a matrix. The columns are the directions in which the three
+    inputs of this torque or force actually act.
     """
 
 
@@ -104,7 +102,7 @@ def apply_faults(faults, triads, t, u, given):
 
 
 def turn_held(robot, point):
-    """Rotate the torques and forces in reference axes of `point.pushing` to base axes, in place."""
+    """Rotate the torques and forces of `point.pushing` from reference to base axes, in place."""
     pushing = point.pushing
     for index in range(len(robot.held)):
         at, turn = robot.held[index], vec.attitude(robot.origin)
@@ -115,7 +113,7 @@ def turn_held(robot, point):
 def push(work, tree, pushing):
     """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
 
-    Torques and forces on the base in `pushing` are in base axes. `bodies.write_columns` must be
+    In `pushing`, torques and forces on the base are in base axes. `bodies.write_columns` must be
     called before `push`, which reads the columns of body-fixed inputs.
     """
     size, count = len(tree.row), len(tree.wrench_body)
@@ -133,7 +131,7 @@ def push(work, tree, pushing):
 def accelerate(work, robot, point, rates, to):
     """Write d(nu)/dt into `rates` from the index `to` on.
 
-    `configure` must be called before. M is overwritten by its factor.
+    `configure` must be called before this function. M is overwritten by its factor.
     """
     tree, nu = robot.tree, point.nu
     force, size = tree.c, len(tree.row)
@@ -230,7 +228,7 @@ def kept_at(reference, t):
 def start_at(work, robot, reference, point):
     """Write the momentum and the centre of mass of the robot at its initial point to `start`.
 
-    `configure` must be called before.
+    `configure` must be called before this function.
     """
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
@@ -265,8 +263,9 @@ def _momentum_error(work, robot, nu, momentum):
 def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
-    `configure` must be called before. The equations are solved for the correction of the velocity,
-    which is small. So the rounding errors of the solution are small too.
+    `configure` must be called before this function. The equations are solved for the correction of
+    the velocity and not for the velocity itself. The correction is small, and so are its rounding
+    errors.
     """
     tree, nu = robot.tree, point.nu
     axes = vec.axes_of(point.q)

@@ -2,7 +2,7 @@
 
 The channel changes the commands of the policy: it applies limits, sample and hold, a delay,
 thruster pulses and the speed limits of wheels. The compiled engine runs the whole loop. The Python
-engine calls only the functions of the channel (see `control.channel`) and `goes_on`.
+engine calls only `goes_on` and the functions of the channel (see `control.channel`).
 """
 
 from collections import namedtuple
@@ -26,7 +26,7 @@ class Wheels(
     A torque u changes the speed w by u dt / J in a step of dt [s]. J = 1 / (M^-1)_ii is the
     effective inertia of the wheel's joint i in the free-floating robot.
 
-    - `at`: index of the wheel's input. `row`: index of its speed in nu.
+    - `at`: index of the wheel's input. `row`: index of the wheel's speed in nu.
     - `least_torque`, `most_torque` [N m]: torque limits of the motor.
     - `least_speed`, `most_speed` [rad/s]: speed limits.
     - `stiffness`: J / dt.
@@ -34,12 +34,14 @@ class Wheels(
 
 
 class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
-    """Pulsed thrusters (k,) that realise the command of each sample by an impulse.
+    """Pulsed thrusters (k,): one pulse per sample delivers the commanded impulse.
 
-    - `at`: index of the thruster's input. `on_off`: whether the thrust is either 0 or `most`.
+    - `at`: index of the thruster's input. `on_off`: True if the thrust can only be 0 or `most`,
+      False if it can have any value between them.
     - `most` [N]: largest thrust. `least` [N s]: least impulse of a pulse.
     - `quantum` [N s]: the impulse of an on-off thruster in one step; unused for other thrusters.
-    - `left` [N s]: the commanded impulse that was not fired; it is added to the next sample.
+    - `left` [N s]: the commanded impulse that was not fired; it is added to the impulse that the
+      next sample commands.
     - `level` [N]: the thrust of the latest pulse. `end`: the first step after this pulse.
     - `time` [s]: the sample time.
     """
@@ -52,10 +54,10 @@ class Channel(
 
     - `low`, `high` (nu,): limits of the commands.
     - `held` (nu,): the command that acts now. `pending` (slots, nu): the commands of the latest
-      samples. Some of them have not arrived yet.
+      samples, including those that have not arrived yet because of the delay.
     - `sample`: number of steps per sample, 0 for continuous commands. `delay` (1,): delay in steps.
-    - `fresh` (1,): 1 in a step in which a command arrives, else 0. It is also 1 at each sample
-      before the first arrival, so that the initial inputs are also pulsed.
+    - `fresh` (1,): 1 in a step in which a command arrives, else 0. Until the first command
+      arrives, it is 1 at the start of each sample, so that the initial inputs are pulsed too.
     """
 
 
@@ -86,8 +88,8 @@ def is_asked(channel, step):
 def transmit(channel, step, nu, u):
     """Replace the command u by the inputs that act in this step.
 
-    The command is read only in steps in which the policy is evaluated (`is_asked`). nu holds the
-    velocities to which `Wheels.row` refers.
+    The command is read only in steps in which the policy is evaluated (`is_asked`). nu contains the
+    wheel speeds, at the indices `Wheels.row`.
     """
     count = len(channel.low)
     if is_asked(channel, step):
@@ -116,8 +118,9 @@ def transmit(channel, step, nu, u):
         for index in range(len(pulses.at)):
             level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
             store(u, pulses.at[index], level)
-    # If a torque would make a wheel exceed its speed limit in this step, reduce the torque, at most
-    # to zero. A torque is never reversed, even if the wheel already exceeds its speed limit.
+    # If a torque would make a wheel exceed its speed limit in this step, reduce the magnitude of
+    # the torque, if necessary to zero. The torque is not reversed, even if the wheel already
+    # exceeds its speed limit.
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
@@ -130,7 +133,7 @@ def transmit(channel, step, nu, u):
 
 
 def _begin_pulses(channel, step, u):
-    """Fire the pulses of a new sample with the commands u; keep the impulse that was not fired.
+    """Fire the pulses of a new sample for the commands u; store the impulses that are not fired.
 
     Lanes in which `fresh` is 0 do not change.
     """
@@ -146,8 +149,8 @@ def _begin_pulses(channel, step, u):
         else:
             level = clipped(wanted / pulses.time, 0.0, most)
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
-        # Due to the tolerance 1e-9, an impulse fires even if rounding errors make it smaller than
-        # the least impulse.
+        # With the tolerance 1e-9, a thruster also fires if only a rounding error makes the impulse
+        # smaller than the least impulse.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
         left, end = wanted - fires * fired, float(step) + fires * length
         store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
@@ -162,15 +165,18 @@ class Method(
 
     - `rates` (1 + s, 6 + n): work space for nu at the start of the step, followed by d(nu)/dt at
       each stage.
-    - `shift` (s + 1, 1 + s): weights of the rows of `rates`. Row i gives the displacement after
-      stage i. After the last stage, the last two rows give two displacements in succession.
-    - `speed` (s, 1 + s): weights of the rows of `rates`. Row i gives nu after stage i.
+    - `shift` (s + 1, 1 + s): the displacement after stage i is the sum of the rows of `rates` with
+      the weights in row i of `shift`. After the last stage, q is displaced twice: first by row
+      s - 1, then by row s.
+    - `speed` (s, 1 + s): nu after stage i is the sum of the rows of `rates` with the weights in row
+      i of `speed`.
     - `origin` (s,): 0 if the displacement after a stage starts at q of the first stage, 1 if it
       starts at q of the second stage.
-    - `nodes` (s,) [s]: times of the stages after the start of the step.
-    - `weights` (s,): weights of the stages in an integral over the step, including h. `moments`
-      (s,): weights of the stages in a double integral over the step, including h^2.
-    - `along`, `first`, `second`: work space for a displacement, and for q at the first two stages.
+    - `nodes` (s,) [s]: times of the stages, measured from the start of the step.
+    - `weights` (s,) [s]: weights of the stages in a time integral over the step; they contain the
+      factor h. `moments` (s,) [s^2]: weights in a double integral; they contain the factor h^2.
+    - `along`: work space for a displacement. `first`, `second`: work space for q at the first and
+      at the second stage.
     - `u` (nu,): inputs at the start of the latest step.
     """
 
@@ -191,9 +197,10 @@ class Arguments(
 ):
     """Arguments of `advance`.
 
-    If `project` is true, each step ends with a correction of the base, which restores momentum and
-    centre of mass (`forward.impose`). If `pushed` is true, external wrenches are integrated for
-    the momentum reference (`forward.add_wrench`).
+    If `project` is true, each step ends with a correction of the base's position and velocity, so
+    that momentum and centre of mass match the momentum reference (`forward.impose`). If `pushed` is
+    true, external wrenches act, and their integrals are added to this reference
+    (`forward.add_wrench`).
     """
 
 
@@ -215,8 +222,8 @@ ARGUMENTS = Struct(
 def _combine(shares, row, rates, out):
     """Write the sum of the rows of `rates`, weighted by a row of `shares`.
 
-    The first row of `rates` is a value at the start of the step: nu, or the state z of a filter.
-    The other rows are its derivatives at the stages.
+    The first row of `rates` is the value of nu, or of the state z of a filter, at the start of the
+    step. The other rows are the time derivatives of nu, or of z, at the stages.
     """
     size = len(out)
     count = len(rates) // size
@@ -229,9 +236,9 @@ def _combine(shares, row, rates, out):
 
 
 def goes_on(stop, origin, q, rates):
-    """Return whether no velocity exceeds its limit and the base is within the chart.
+    """Return True if all velocities are below their limits and the base is within the chart.
 
-    `rates` are the velocities. Compiled code returns true only if both conditions are met in all
+    `rates` are the velocities. Compiled code returns True only if both conditions are met in all
     lanes.
     """
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
@@ -263,9 +270,10 @@ def _move(robot, method, point, stage):
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs to the step `last`, or until one of them meets a stop condition.
 
-    `words` represent `Arguments`. The function updates the point, the momentum reference, the state
-    of the policy and the state of the channel. clock (1,) is the number of finished steps. Before
-    step 0, the initial momentum and centre of mass are written into the momentum reference.
+    `words` are the 64-bit words of `Arguments`, see `kernel.tree`. The function updates the point,
+    the momentum reference, the state of the policy and the state of the channel. clock (1,) is the
+    number of finished steps. Before step 0, the initial momentum and centre of mass are written
+    into the momentum reference.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
@@ -325,19 +333,19 @@ class RunStatistics(
     """Statistics of the errors of eight runs, and the reference from which errors are measured.
 
     - `x_ref` (nx,): the reference state. `path.point.q` contains its attitude as a quaternion.
-    - `q_ref`, `nu_ref`: with a moving reference, the rows of q and nu at all steps; else empty.
-    - `law`: the law by which `read_state` computes states.
-    - `kind` (nx,): the index of the kind to which each state belongs. One kind, for example, is all
-      joint positions. The index is 0 for the attitude and for states without a kind, and -1 for
-      states that `largest_x` ignores.
-    - `settled`, `tolerance` (kinds,): the error of a kind has settled when it stays below `settled`
-      times its largest value, or below its `tolerance`.
-    - `steps` (times,): the steps at which `errors` (of the kinds), `inputs` and `states` (errors of
-      the states) are recorded.
+    - `q_ref`, `nu_ref`: q and nu of a moving reference, one row per step; else empty.
+    - `law`: the `Law` with which `read_state` computes states.
+    - `kind` (nx,): the states are grouped into kinds; the joint positions, for example, are one
+      kind. Each entry is the index of the kind of one state. The index 0 is for the attitude, and
+      for states that count only in `largest_x`. The index -1 is for states that do not count.
+    - `settled`, `tolerance` (kinds,): the bound for settling is `settled` times the largest error
+      of the kind, or `tolerance` if `tolerance` is larger.
+    - `steps` (times,): the steps at which values are recorded: the errors of the kinds in `errors`,
+      the inputs in `inputs`, and the errors of the states in `states`.
     - `at`: work space for the point. All fields after `at` have one column per lane.
-    - `sizes`: the present errors of the kinds. `largest`: their largest values up to now.
+    - `sizes`: the present errors of the kinds. `largest`: the largest errors of the kinds so far.
     - `largest_x`, `largest_u`: the largest magnitudes of the states' errors and of the inputs.
-    - `outside`: the last step at which the error of a kind had not settled.
+    - `outside`: for each kind, the last step at which the error exceeded the bound for settling.
     """
 
 
@@ -360,8 +368,8 @@ def _grow(stats, index, value):
 def _compare(stats, step):
     """Write the errors of the states and of the kinds at a step, and update `largest_x`.
 
-    The error of a kind is the largest magnitude among its states. The error of kind 0 is the angle
-    [deg] of the attitude error.
+    The error of a kind is the largest magnitude of the errors of its states. The error of kind 0 is
+    the angle [deg] of the attitude error.
     """
     at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
     if len(stats.q_ref) > 0:
@@ -386,9 +394,9 @@ def _compare(stats, step):
 
 
 def take(words, rows, first, count):
-    """Update the statistics with `count` rows of `advance`, one per step from `first` on.
+    """Update the statistics with rows of `advance`, one row for each of `count` steps.
 
-    `words` represent `RunStatistics`.
+    `first` is the first of these steps. `words` are the 64-bit words of `RunStatistics`.
     """
     stats = RUN_STATISTICS(words)
     at, sizes, kept = stats.at, stats.sizes, 0
@@ -403,8 +411,8 @@ def take(words, rows, first, count):
         for kind in range(len(sizes)):
             value = load(sizes, kind)
             _grow(stats.largest, kind, value)
-            # A new maximum above the tolerance exceeds its own bound, so it resets the settling
-            # time.
+            # If the error is a new maximum above the tolerance, it exceeds the bound for settling,
+            # which is only a fraction of this maximum. So the settling time starts anew.
             bound = stats.settled * load(stats.largest, kind)
             bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
             store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))

@@ -2,15 +2,16 @@
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
 machine code for each function together with all functions that it calls. A function at the end of a
-chain of ten calls would be compiled ten times. In this module, a *part* is a function that is
-called only by compiled functions. numba keeps a part as LLVM code (LLVM's intermediate
-representation). A part becomes machine code only within the function that Python calls.
+chain of ten calls would be compiled ten times. This module avoids the repetition: a *part* is a
+function that is called only by compiled functions, and numba keeps it as LLVM code (LLVM's
+intermediate representation). Machine code is generated only for a function that Python calls,
+together with all parts that it needs.
 
 The operations of `kernel.vectors` are compiled for one number or for eight numbers. An array with
-one axis holds numbers. An array with a second axis of eight holds lanes: each lane is one robot,
-and one instruction computes all eight. If an operation combines lanes with a double, the double
-stands for eight equal numbers. So a function that is written for one number can be compiled for
-eight.
+one axis holds numbers. An array with a second axis of length eight holds lanes: each lane is one
+robot, and one instruction computes all eight. If an operation combines lanes with a double, the
+double stands for eight equal numbers. So a function that is written for one number can be compiled
+for eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So the eight numbers of an entry are one
 value of the vector type `Lanes`, whose operations LLVM compiles to vector instructions. If a
@@ -80,7 +81,7 @@ def _spread(
 
 
 def _alike(*kinds: Type) -> Signature:
-    """Return the signature of an operation on lanes if an operand has lanes, else on doubles."""
+    """Return the signature of an operation: on lanes if any operand has lanes, else on doubles."""
     kind = lanes if lanes in kinds else float64
     return kind(*[kind] * len(kinds))
 
@@ -108,7 +109,7 @@ _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Return a decorator for the generator of the code that replaces a function of `vectors`.
+    """Return a decorator for a code generator; its code replaces a function of `vectors`.
 
     If the first argument of the replaced function is an array, the generator receives the address
     of the array's first entry instead. This entry is a double or a vector of eight doubles.
@@ -204,10 +205,10 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
 
 
 class _NoEnvironments:
-    """numba code generator for parts, which sets no environment.
+    """numba code generator for parts; unlike numba's own, it sets no environment.
 
-    An environment is the run-time data of a numba function. numba would store its address in the
-    function's machine code, but a part has no machine code.
+    An environment is the run-time data of a numba function. numba would store the address of the
+    environment in the function's machine code, but a part has no machine code.
     """
 
     def __init__(self, codegen: object) -> None:
@@ -221,7 +222,7 @@ class _NoEnvironments:
 
 
 class PartLibrary(CPUCodeLibrary):
-    """numba library that contains the LLVM code of a part and refers to the parts that it calls."""
+    """numba library with the LLVM code of a part, and references to the parts that it calls."""
 
     _whole: ir.Module | None = None
 
@@ -231,7 +232,7 @@ class PartLibrary(CPUCodeLibrary):
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
-        """Mark the library as complete without optimising its code."""
+        """Mark the library as complete, but do not optimise its code."""
         self._raise_if_finalized()
         self._finalized = True
 
@@ -271,7 +272,7 @@ class PartLibrary(CPUCodeLibrary):
 
 
 class PartCompiler(Compiler):
-    """numba's compiler pipeline with a `PartLibrary` for the result."""
+    """numba's compiler pipeline, with the result in a `PartLibrary`."""
 
     def __init__(
         self, typing: TypingContext, target: BaseContext, library: CodeLibrary, *rest: object
@@ -321,7 +322,7 @@ def _field(
 
     def word(place: int) -> ir.Value:
         value = builder.load(at(place))
-        # The words are constant during a call, so compiled code may read each word only once.
+        # The words are constant during a call, so LLVM may reuse a word that was read before.
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
         return value
 
@@ -360,8 +361,8 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
 
 # "contract": a product and a sum may become one fused instruction, which rounds once. "numpy": a
 # division by zero gives infinity or NaN, and no error. "_nrt": reference counting of arrays is off,
-# because it would take three quarters of the running time. So kernel functions cannot allocate
-# arrays.
+# because it would take three quarters of the running time. Without reference counting, kernel
+# functions cannot allocate arrays.
 _OPTIONS: dict[str, object] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, object] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -386,8 +387,8 @@ class Compiled(Protocol):
 def translated(function: FunctionType, how: str = "") -> Compiled:
     """Return a function of the kernel as a numba function that calls only numba functions.
 
-    `how` must be "compiled" for a function that Python calls. Its machine code is stored on disk.
-    By default, the function becomes a part.
+    By default, the function becomes a part. For a function that Python calls, `how` must be
+    "compiled"; the machine code is then stored on disk.
     """
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:

@@ -22,20 +22,23 @@ class Path(
         "Path", "t q u shift speed hold ahead ends held over last starts K order along e point"
     )
 ):
-    """A trajectory and its gains as piecewise polynomials.
+    """A trajectory and the gains of its feedback as piecewise polynomials.
 
     - `t` (N,) [s]: the times of the knots. `q`, `u`: one row per knot.
     - `shift`, `speed`: coefficients (4, 6 + n) of cubic polynomials for each interval between two
       knots. The cubics of `shift` give the displacement from the interval's first knot. The cubics
-      of `speed` give nu. Their variable is the elapsed fraction of the interval.
+      of `speed` give nu. The variable of both cubics is the elapsed fraction of the interval.
     - `hold`: if true, u is constant between knots, else linear. u is evaluated `ahead` [s] after
       the current time.
     - `held`: for each vector of three inputs in world axes, the index of its first input.
-    - `K`: for each time in `starts`, `order` matrices (nu, nx). They are the coefficients of a
-      polynomial in the time since this start. K is constant after `last` [s].
-    - `ends`: whether the trajectory ends before the run. Then q, u, `speed` and K have one further
-      row, which applies at times t > `over` [s].
-    - `along` (6 + n,), the error `e` (nx,) and the followed `point` are work space.
+    - `K`: the gain is a polynomial in time on each of several intervals, which begin at the times
+      `starts` (m,) [s]. `K` contains the coefficients (m, `order`, nu, nx). The variable of a
+      polynomial is the time since the start of its interval. From `last` [s] after the start of the
+      trajectory, the gain is constant.
+    - `ends`: True if the trajectory ends before the run. In this case, `q`, `u`, `speed` and `K`
+      have one further row, which applies at times of the run after `over` [s].
+    - Work space: `along` (6 + n,) for a displacement, `e` (nx,) for the error, and `point` for the
+      followed point.
     """
 
 
@@ -57,9 +60,9 @@ def _latest(knots, time):
 
 
 def _placed(knots, time):
-    """Return the index of the interval between knots that contains a time, and its elapsed part.
+    """Return the index of the knot interval that contains a time, and the elapsed fraction.
 
-    The elapsed part is a fraction from 0 to 1.
+    The fraction is 0 at the first knot of the interval, and 1 at its last knot.
     """
     last = len(knots) - 2
     k = min(_latest(knots, time), last)
@@ -72,8 +75,8 @@ def _placed(knots, time):
 def error(robot, path, point):
     """Write the error (5.1) of `point` relative to the followed point into `path.e`.
 
-    The position error is in the axes of the followed base. The velocity error is the difference of
-    the two nu, each of which is in the axes of its own base.
+    The followed point is `path.point`. The position error is in the axes of its base. The velocity
+    error is the nu of `point` minus the nu of the followed point, each in the axes of its own base.
     """
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
@@ -97,7 +100,7 @@ def error(robot, path, point):
 def track(robot, path, point, u, t):
     """Write the command u* - K e at the time t of the run; u* are the trajectory's inputs.
 
-    Wrenches in world axes are converted to the axes of the followed base.
+    Wrenches of the trajectory in world axes are rotated to the axes of the trajectory's base.
     """
     # Evaluate the trajectory at this time.
     there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)
@@ -150,17 +153,20 @@ class Law(
 ):
     """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
 
-    - `kind`: NOTHING, LINEAR or TRACK. LINEAR computes u from y with `grid` if the grid has joints,
-      and otherwise with `filter`. TRACK computes u = u* - K e along `path`.
+    - `kind`: NOTHING, LINEAR or TRACK. NOTHING computes no command. LINEAR computes u from y, with
+      `grid` if the grid has joints, otherwise with `filter`. TRACK computes u = u* - K e along
+      `path`.
     - `x`: the state (nx,), followed by the three outputs of each gyroscope.
     - `gyros` (k,): the index of the body that carries each gyroscope. `gyro_axes` (9 k,): the three
       axes of each gyroscope, in the axes of its body.
     - `y` (ny,): the outputs, which are the entries `measured` of x plus noise. The noise of each
       sample is one row of `added` (slots, ny). After the last row, the first row is used again.
-    - `turned` (2,): whether omega_b and v_b of the state are in reference axes.
-    - `origin` (rows, 7): pose of the world frame relative to the pose at which q_b and r_b are 0.
-    - `near` (rows, n): positions for unwrapping. The unwrapped angle of a continuous joint differs
-      from its position in `near` by at most pi.
+    - `turned` (2,): for omega_b and for v_b of the state, True if in reference axes, False if in
+      base axes.
+    - `origin` (rows, 7): pose of the world frame relative to the reference, which is the pose of
+      the base at which q_b and r_b are 0.
+    - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint
+      differs from the position of the joint in `near` by at most pi.
     - `origin` and `near` have one row per sample. The last row also applies to all later samples.
     - `u`: the command. If `allocation` has inputs, the command is distributed to these inputs.
     """
@@ -196,7 +202,7 @@ LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocatio
 def read_state(robot, law, point, row):
     """Write the state of a point into `law.x`.
 
-    `row` is the index of the row of `law.origin` and `law.near` that applies.
+    `row` is the index of the row to be used from `law.origin` and from `law.near`.
     """
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
     position, turn = vec.get3(law.origin, 7 * row), vec.attitude(law.origin, 7 * row)
@@ -278,7 +284,8 @@ def _corner(grid, corner, lane):
     """Return the weight of a grid corner in the interpolation, and the index of its gain in `K`.
 
     The corner belongs to the grid cell that contains the joint positions of the lane. Bit i of
-    `corner` is 1 at the upper grid value of joint i, and 0 at the lower grid value.
+    `corner` is 1 if the corner is at the upper grid value of joint i, and 0 if it is at the lower
+    grid value.
     """
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
@@ -296,7 +303,7 @@ def _corner(grid, corner, lane):
 
 @called
 def _filter(by, y, u, row, stage):
-    """Write the command of a linear controller `by`, and its next state or state derivative."""
+    """Write the command of the linear controller `by`, and its next z or dz/dt; see `Filter`."""
     size, outputs, inputs = len(by.z), len(y), len(u)
     along = len(by.rates) > size
     first = (1 + stage) * size if along else 0

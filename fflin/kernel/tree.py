@@ -1,10 +1,10 @@
 """Arguments of the kernel: named tuples of arrays, such as the kinematic tree of a robot.
 
-numba compiles a function for each set of argument types, and passes a named tuple as separate
-arrays. `kernel.loop` therefore receives its named tuples as one array of 64-bit words. In compiled
-code, a `Struct` is a pointer into this array, and each field is read when it is used. So the
-argument types are always the same, and a call within compiled code passes one pointer. The words
-must not change during a call.
+numba compiles a function again for each new set of argument types, and passes a named tuple as
+many separate arrays. To avoid both, `kernel.loop` receives its named tuples as one array of 64-bit
+words. In compiled code, a `Struct` is a pointer into this array, and each field is read when it is
+used. So the argument types are always the same, and a call within compiled code passes one pointer.
+The words must not change during a call.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Struct(Generic[T_co]):
         self.name = f"Struct({made.__name__})"
 
     def __call__(self, words: T) -> T:
-        """Return a named tuple unchanged; compiled code interprets an array of words instead."""
+        """Return a named tuple unchanged; compiled code replaces this call by `opener`."""
         return words
 
 
@@ -159,18 +159,19 @@ class Tree(
 
     Body 0 is the base, which has the coordinates 0 to 5. Every other body has one joint, which
     connects it to its parent. Bodies are in Pinocchio's order, and coordinates are in the order of
-    nu. In `kernel.loop`, the compiled code has one column per lane for `fixed`, `bodies`, `wrench`,
-    `stored`, `stiffness` and `damping`.
+    nu. In the compiled code of `kernel.loop`, the fields `fixed`, `bodies`, `wrench`, `stored`,
+    `stiffness` and `damping` have one column per lane.
 
     Fields with one value or row per body:
 
     - `parent`: index of the parent body.
     - `fixed` (12): pose of the joint frame relative to the parent's joint frame, for the joint
       position zero: the three columns of the rotation, then the origin. z is along the joint axis.
-    - `index`: index of the joint position in q. `unbounded`: whether q holds the cosine and sine of
-      the joint angle instead.
+    - `index`: index of the joint position in q. `unbounded`: True if q contains the cosine and the
+      sine of the joint angle at this index and the next one, instead of the joint position.
     - `turns`, `slides`: rotation about z and translation along z per unit of the joint position.
-    - `bodies` (10): m, m c, and the inertia about the joint's origin as xx xy xz yy yz zz.
+    - `bodies` (10): the mass m, the first moment m c with the centre of mass c, and the inertia
+      about the joint's origin as xx xy xz yy yz zz.
     - `axes` (3, 3): rotation from the joint frame to Pinocchio's joint frame.
     - `coordinate`: the coordinate that moves the joint. `factor`: the joint motion per unit of this
       coordinate.
@@ -181,11 +182,13 @@ class Tree(
     - `row`, `depth` (6 + n,): the offset of each row, and the number of its entries before the
       diagonal.
     - `path`: the column of each entry.
-    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that both contain.
-    - `target`, `share`: one value for each pair of a body and a body on its path to the base,
-      including the body itself. `target` is the entry of M to which the pair contributes, and
-      `share` is the factor of this contribution. After the pairs of a body, one further value
-      refers to the six entries that couple its coordinate to the base: `target` is the first entry.
+    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that are in both rows.
+    - `target`, `share`: the contributions of the bodies to M, from the last body to the first. A
+      body forms a pair with itself, and with each body between it and the base. For each pair,
+      `target` is the index of the entry of M to which the pair contributes, and `share` is the
+      factor of the contribution. The pairs of a body are followed by one value for the six entries
+      that couple the coordinate of the body to the base: `target` is the index of the first entry,
+      and `share` is the factor of all six.
 
     Fields for the forces:
 
@@ -234,7 +237,7 @@ def batch_tree(robot: Robot) -> Tree | None:
         dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
         inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
     state, size = StateMap(robot), 6 + robot.n
-    # In v = S nu, the row of a joint has one nonzero entry: the joint motion per unit of the
+    # In v = S nu, the row of S for a joint has one nonzero entry: the joint motion per unit of the
     # coordinate that moves the joint.
     S, of_v = state.spread(np.eye(size)).T, [joint.idx_v for joint in joints]
     coordinate = np.abs(S).argmax(axis=1)[of_v].tolist()
@@ -323,10 +326,10 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return the columns of the entries of each row of L (M = L^T D L), the diagonal last."""
+    """Return the columns of the nonzero entries in each row of L (M = L^T D L), diagonal last."""
     # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
-    # branches. Fill-in during the factorisation joins the coordinates of these ancestors to one
-    # path (Liu's elimination tree).
+    # branches. The factorisation fills in entries, so that the coordinates of all these ancestors
+    # are on one path (Liu's elimination tree).
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

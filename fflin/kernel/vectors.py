@@ -21,7 +21,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 
-_TERMS = 10  # exact to machine precision up to half a turn; a step rotates by less than a radian
+_TERMS = 10  # exact to machine precision for angles up to pi; a step rotates by less than 1 rad
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -31,7 +31,7 @@ Number: TypeAlias = float
 # of an array.
 Entries: TypeAlias = Array | list[Number]
 
-# Functions of the kernel that numba does not inline. All other functions are inlined in their
+# Functions of the kernel that numba does not inline. All other functions are inlined into their
 # callers.
 CALLED: set[Callable[..., object]] = set()
 # {function: function or operation that compiled code uses in its place}.
@@ -39,13 +39,13 @@ IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Mark a rarely called function, which numba must not inline; this saves compilation time."""
+    """Mark a rarely called function, so that numba does not inline it; this saves compile time."""
     CALLED.add(function)
     return function
 
 
 def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
-    """Return a decorator for a NumPy function, for which compiled code substitutes `loop`."""
+    """Return a decorator for a NumPy function that compiled code replaces by `loop`."""
 
     def noted(function: F) -> F:
         IN_PLACE[function] = called(loop)
@@ -212,8 +212,9 @@ def times6(s, value):
 def cosine_and_sine(x):
     """Return the cosine and sine of x, accurate to one unit in the last place for |x| < 1e6.
 
-    A multiple of pi/2 is subtracted from x in three parts, so that |x| <= pi/4. There, the cosine
-    and the sine are polynomials. All coefficients are from fdlibm (Sun Microsystems, 1993).
+    A multiple of pi/2 is subtracted from x, so that |x| <= pi/4. For accuracy, pi/2 is the sum of
+    three numbers. For |x| <= pi/4, polynomials approximate the cosine and the sine. All
+    coefficients are from fdlibm (Sun Microsystems, 1993).
     """
     turns = floor(x * (2.0 / np.pi) + 0.5)
     x = x - turns * 1.57079632673412561417e00
@@ -282,7 +283,7 @@ def columns_of(quaternion):
 
 
 def attitude(q, at=0):
-    """Return the base's quaternion of the configuration that begins at the index `at`."""
+    """Return the base's quaternion from the configuration q that begins at the index `at`."""
     return get3(q, at + 3), load(q, at + 6)
 
 
@@ -292,7 +293,10 @@ def axes_of(q):
 
 
 def displace(tree, q, along, out):
-    """Write q, displaced by the tangent vector `along`; the base moves by the exponential map."""
+    """Displace q by the tangent vector `along`, and write the result into `out`.
+
+    The base moves by the exponential map.
+    """
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square

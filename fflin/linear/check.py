@@ -48,14 +48,14 @@ _ULPS = 8.0
 # Assumed rounding error [ulp] of a finite difference of accelerations.
 _STEP_ULPS = 64.0
 
-# The relative tolerance for the comparison with ABA derivatives is the larger of two values: the
-# first number, and the second number times the condition number of M.
+# The relative tolerance for the comparison with ABA derivatives is the larger of two values:
+# _ROUTE_TOLERANCE, and _ROUTE_ROUNDING times the condition number of M.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# The same two numbers for sixth-order finite differences. They are larger, because the division by
-# a small step amplifies rounding errors.
+# The same for the comparison with finite differences. These two numbers are larger, because the
+# division by a small step amplifies rounding errors.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
-# Largest expected ratio of the error of ABA's derivatives to the residual of ABA's M^-1.
+# Largest expected ratio of the error of ABA's derivatives to the residual M M^-1 - I of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
 # Upper bound of all tolerances, even for an ill-conditioned M. A larger tolerance would confirm
@@ -63,13 +63,15 @@ _ROUTE_SAFETY = 10.0
 _LOOSEST = 1e-2
 
 # The terms with the base's linear velocity cancel in exact arithmetic. Numerically, they leave
-# rounding errors of about 1e-16 of their size. Errors are therefore divided by a scale that
-# includes the following fraction of these terms. A larger fraction would hide other errors.
+# rounding errors of about 1e-16 of their magnitude. The errors of A are therefore divided by a
+# scale that includes this fraction of the terms. The fraction times the tolerance 1e-9 is far
+# above 1e-16. A larger fraction would hide other errors.
 _ROUNDING_FRACTION = 1e-3
 
 
-# If the base is faster than this speed [m/s], its velocity is measured relative to an observer that
-# moves with it. Otherwise, the rounding errors of this velocity would hide the other velocities.
+# If the base is faster than this speed [m/s], velocities are measured relative to an observer that
+# moves with the constant velocity of the base at the operating point. Without such an observer, the
+# rounding errors of the base velocity would hide the other velocities.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -185,7 +187,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 def check_all(
     robot: Robot, models: Iterable[LinearModel], title: str = "", *, tolerance: float | None = None
 ) -> Check:
-    """Check models, and keep one row per comparison: the row with the largest error / tolerance."""
+    """Check models; for each comparison, keep only the row with the largest error / tolerance."""
     if tolerance is not None:
         tolerance = share("tolerance", tolerance)
     worst: dict[tuple[str, str], Row] = {}
@@ -215,9 +217,9 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    # If links are far apart, ABA is less accurate than the composite-rigid-body algorithm, which
-    # computes M. So the error of ABA's derivatives is estimated from the residual M M^-1 - I, where
-    # ABA computes M^-1.
+    # If links are far apart, ABA is less accurate than the composite-rigid-body algorithm. So the
+    # error of ABA's derivatives is estimated from the residual M M^-1 - I, in which the
+    # composite-rigid-body algorithm computes M, and ABA computes M^-1.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     yield "ABA derivatives", scales.errors(A, B), by_aba
@@ -225,12 +227,13 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
     model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
     # If light links are aligned, even a small rotation of a joint changes the accelerations
-    # strongly. The steps of the finite differences must be smaller than such a rotation.
+    # strongly. So the steps of the finite differences must be small.
     steps = np.full(nx + len(lin.u0), 2e-4)
-    # Keep the points well inside the chart, because f is steep near the chart's limit |q_b| = 1.
+    # Keep the points of the differences well inside the chart, because f is steep near the limit
+    # |q_b| = 1 of the chart.
     steps[g.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
-    # f is quadratic in the velocities and linear in the inputs. So central differences with large
-    # steps have no truncation error.
+    # f is quadratic in the velocities and linear in the inputs. So central differences have no
+    # truncation error, even with large steps.
     speed = np.abs(lin.x0[-nv:])
     steps[nv:nx] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
     steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
@@ -269,7 +272,8 @@ def _output_errors(
 ) -> dict[str, float]:
     """Return the errors of y0, C and D.
 
-    y0 is compared with the nonlinear outputs, C and D with finite differences of these outputs.
+    y0 is compared with the outputs of the nonlinear model, and C and D are compared with finite
+    differences of these outputs.
     """
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
@@ -283,9 +287,9 @@ def _output_errors(
 
     here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
     errors = {"y0": _largest(lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-    # Divide the errors of a row by the row's largest derivative, or by `noise` if this is larger.
-    # `noise` is the rounding error of y / step, divided by the tolerance. So a rounding error alone
-    # does not exceed the tolerance.
+    # Divide the errors of a row by the largest derivative of the row, or by `noise` if `noise` is
+    # larger. `noise` is the rounding error of y / step, divided by the tolerance. So a rounding
+    # error alone does not exceed the tolerance.
     noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
     for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
         largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
@@ -348,9 +352,9 @@ def aba_route(
     state = aba.state
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Pinocchio differentiates about the world's origin, so a distant base would reduce the
-    # accuracy. Place the base at the origin. This is allowed, because no derivative depends on the
-    # position of the base, even in orbit.
+    # Place the base at the world's origin, because Pinocchio differentiates about this origin, and
+    # a distant base would reduce the accuracy. Moving the base is allowed, because no derivative
+    # depends on the position of the base, even in orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
@@ -391,17 +395,17 @@ class Scales:
     def errors(
         self, A: Array, B: Array, *, steps: Array | None = None, rounding: float = 0.0
     ) -> dict[str, float]:
-        """Compare the model with other A and B; return the error of each block "A[q_b, q_m]" etc.
+        """Compare the model with other A and B; return {block: error}.
 
-        If A and B were computed by finite differences, `steps` (nx,) are the steps of the
-        differences. `rounding` is then the rounding error of the differences, divided by the
-        tolerance.
+        A block is, for example, "A[q_b, q_m]". If A and B were computed by finite differences, give
+        the steps (nx,) of the differences in `steps`, and the rounding error of the differences,
+        divided by the tolerance, in `rounding`.
         """
-        # Divide rows of accelerations by the mobility of their coordinate, so that a light joint
-        # does not hide the error of a heavy joint. Also divide the columns of B by the mobility of
-        # their input. The errors of a block of A are then relative to its largest entry. If larger
-        # terms cancel in this block, the errors are relative to the size of these terms, because
-        # their rounding errors do not cancel.
+        # Divide each row of an acceleration by the mobility of its coordinate, so that a light
+        # joint does not hide the error of a heavy joint. Divide each column of B by the mobility of
+        # its input. After this scaling, divide the errors of a block of A by the largest entry of
+        # the block. If larger terms cancel in the block, divide by the magnitude of these terms
+        # instead, because their rounding errors do not cancel.
         state, lin, nv = self._state, self._lin, self._nv
         terms = self._terms
         if steps is not None:
@@ -420,12 +424,12 @@ class Scales:
         return errors
 
     def _sizes(self, v: Array) -> tuple[Array, float]:
-        """Return the sizes of terms that cancel: (6, 6) for the blocks of A, and one for f0.
+        """Return magnitudes of terms that cancel: (6, 6) for the blocks of A, and one for f0.
 
-        Rows of accelerations are divided by the mobility of their coordinate.
+        In the rows of accelerations, the terms are divided by the mobility of their coordinate.
         """
-        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because in Pinocchio's
-        # derivatives it causes only rounding errors.
+        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because the terms with
+        # this velocity contribute only rounding errors to Pinocchio's derivatives.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -436,7 +440,8 @@ class Scales:
             momentum += float(np.linalg.norm(stored))
         rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
         # Gyroscopic torque of the wheels per unit angular velocity of their link, multiplied by the
-        # largest mobility, as in the scaled rows of accelerations.
+        # largest mobility. A torque times the mobility is the scaled acceleration, because the
+        # acceleration is the torque times the squared mobility.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
         slowed = speed.copy()
         slowed[LINEAR] *= _ROUNDING_FRACTION
@@ -446,9 +451,9 @@ class Scales:
         terms: Array = np.zeros((6, 6))
         terms[:3, :3] = _largest(speed[:6])
         terms[3:, :3] = accelerations + forces + rate * (_largest(resting) + spin)
-        # Sizes of the derivatives of the velocity-dependent accelerations over omega_b, v_b and the
-        # joint velocities, at the velocity v. The derivatives over omega_b and the joint velocities
-        # also contain the linear velocity of the base.
+        # Magnitudes of the derivatives of the velocity-dependent accelerations with respect to
+        # omega_b, v_b and the joint velocities, at the velocity v. The derivatives with respect to
+        # omega_b and to the joint velocities also contain the linear velocity of the base.
         turning = rate * np.array([*map(_largest, np.split(unit, (3, 6)))])
         turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
         terms[3:, 3:] = turning
@@ -459,7 +464,7 @@ class Scales:
 class Nonlinear:
     """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, computed by ABA.
 
-    If the linear model has a moving reference, x is the error relative to this reference. Then f is
+    If the linear model has a moving reference, x is the error relative to this reference, and f is
     0 at the operating point.
     """
 
@@ -469,7 +474,7 @@ class Nonlinear:
         observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         moves = np.linalg.norm(observer) > _FAST and aba.field is None
         self._observer = observer if moves else np.zeros(3)
-        # Velocity and acceleration of a moving reference; zero for a fixed one.
+        # Velocity and acceleration of a moving reference; zero for a fixed reference.
         self._v: Array = np.zeros((1, aba.state.robot.nv))
         self._a: Array = np.zeros_like(self._v)
         if lin.moving:
@@ -503,8 +508,8 @@ class Nonlinear:
         position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
-            # `rate` contains the derivative of the components of v in base axes. Add w x v, so that
-            # it becomes the derivative of v relative to the reference.
+            # `rate` contains the time derivative of the components of v in base axes, which rotate.
+            # Add w x v to obtain the time derivative of v relative to the reference axes.
             rate[:, LINEAR] += np.cross(angular, linear)
         rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
         joint_rates = state.velocities(v - self._v)[:, 6:]
@@ -540,7 +545,7 @@ def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved:
     """Return the Jacobian of f at a point, computed by central differences with the given steps.
 
     f maps rows of points to rows of values. The mask `is_curved` selects the variables for which
-    sixth-order differences are used. For all other variables, differences of second order are used.
+    sixth-order differences are used. For all other variables, second-order differences are used.
     """
     curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
     offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))

@@ -19,8 +19,8 @@ from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Assumed rounding error of M a, of accelerations and of principal moments of inertia, relative to
-# the magnitudes of the terms in their sums.
+# Assumed rounding error of forces and of principal moments of inertia, relative to the magnitudes
+# of the terms whose sum they are. Also the largest spring deflection [rad or m] that is not shown.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -208,7 +208,10 @@ def equilibrium(
 
 
 class _Balance:
-    """Minimum-norm inputs, in base axes, to balance the forces at a point, and residual forces."""
+    """Minimum-norm inputs that balance the forces at a point, and the residual forces.
+
+    The inputs are in base axes.
+    """
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
@@ -240,9 +243,11 @@ class _Balance:
 def _require_steady(lin: LinearModel, drift: Array) -> None:
     """Raise `EquilibriumError` if the motion of a joint or of the base changes the forces.
 
-    `drift` (nx,) is the state derivative. Three motions raise the error: a joint that is not a
-    rotor moves, the base moves in an orbital frame, or under gravity, the base rotates about an
-    axis that is not vertical.
+    `drift` (nx,) is the state derivative. The error is raised in three cases:
+
+    - A joint that is not a rotor moves.
+    - In orbit, the base moves relative to the orbital frame.
+    - Under gravity, the base rotates about an axis that is not vertical.
     """
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
@@ -456,7 +461,8 @@ def relative_equilibria(
         k_a, k_r = (normal - radial) / along, (normal - along) / radial
         b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
         # Solve the equation (14.8) of roll and yaw, mu^2 + b mu + c = 0 with mu = lambda^2 / n^2.
-        # This form of the solution avoids cancellation.
+        # To avoid cancellation, compute the root `larger` of larger magnitude first. The
+        # other root is c / larger.
         apart = np.sqrt(complex(b * b - 4.0 * c))
         larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
         squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)

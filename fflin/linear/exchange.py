@@ -187,8 +187,8 @@ def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # The input axes of the tool may rotate relative to the input axes of the model. An input that
-    # is constant in the axes of the model then varies with the attitude in the axes of the tool
+    # The input axes of the tool may rotate relative to the input axes of the model. If so, the
+    # components of a constant input of the model in the axes of the tool vary with the attitude
     # (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
@@ -300,7 +300,8 @@ def _jacobians_at(
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
     """Transform A and B by (15.3) to (15.5).
 
-    `source` has the Jacobians of the present coordinates, `to` of the new coordinates.
+    `source` contains the Jacobians of the present coordinates, and `to` contains the Jacobians of
+    the new coordinates.
     """
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)

@@ -4,8 +4,9 @@ A model in csv consists of several tables. They are for other programs; fflin do
 Each matrix has a table with the names of its rows and columns. The states, the inputs and the
 outputs have a table each. The table ``info`` contains all other entries.
 
-A trajectory in csv is one table. Its last column contains the digest of the other columns in every
-row. The digest therefore needs no extra line, which other programs could not read.
+A trajectory in csv is one table. Every row of its last column repeats the same digest, which is
+computed from the other columns. So the digest needs no extra line, which other programs could not
+read.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def record_of(lin: LinearModel) -> Record:
 def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
     """Write the entries of a model to a file; see `LinearModel.save`.
 
-    If `checksummed`, the file also contains their digest, except in csv.
+    If `checksummed` is True, the file also contains the digest of the entries, except in csv.
     """
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
@@ -155,9 +156,10 @@ def given(value: T, _: object) -> T:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that is not part of a model, but would be overwritten by saving NAME.csv.
+    """Return a file that does not belong to a model, but would be overwritten by saving a model.
 
-    Return None if there is no such file.
+    `path` is the path NAME.csv to which the model would be saved. Return None if there is no such
+    file.
     """
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
@@ -288,8 +290,8 @@ def _entries(columns: Record, robot: Robot) -> Record:
     require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
-    # The last row may lack inputs, because inputs that are constant between knots have no value at
-    # the last knot.
+    # The last row may lack inputs: if inputs are constant between knots, the last interval ends at
+    # the last knot, and no input acts after it.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
         entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])

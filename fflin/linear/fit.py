@@ -25,7 +25,7 @@ Signals: TypeAlias = tuple[Names, Names]
 
 
 def about_point(lin: object) -> LinearModel:
-    """Return a linear model about a point; raise `InputError` for a moving reference."""
+    """Return `lin` if it is a linear model with a fixed reference, else raise `InputError`."""
     model = instance("lin", lin, LinearModel, "a fflin.LinearModel")
     if model.moving:
         raise InputError(
@@ -52,7 +52,7 @@ def require_fit(
 
 
 def signals_of(state: StateMap, kind: str) -> Signals:
-    """Return the names and units of a robot's signals; `kind` is state, input or output."""
+    """Return the names and units of a robot's signals; `kind` is "state", "input" or "output"."""
     found: StateMap | Actuation | Sensing = state
     if kind == "input":
         found = Actuation(state)
@@ -94,7 +94,8 @@ def require_same(
 def require_turns(made: str, size: int, robot: Robot) -> None:
     """Raise `InputError` if a configuration of the robot does not have `size` entries.
 
-    The size differs if other joints are continuous.
+    The number of entries depends on which joints are continuous, because the angle of a continuous
+    joint has two entries, its cosine and sine.
     """
     if size != robot.nq:
         raise InputError(

@@ -247,8 +247,8 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# Relative accuracy of a sample's transition matrix. The integration steps are halved until it is
-# reached, or until each interval between knots has _MOST_PARTS parts.
+# Relative accuracy of a sample's transition matrix. The integration steps are halved until this
+# accuracy is reached, or until each interval between knots has _MOST_PARTS parts.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
@@ -290,8 +290,8 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
             finer = _through(traj, [batch[k] for k in coarse], parts)
             pending = []
             for k, each in zip(coarse, finer, strict=True):
-                # Halving the steps divides the error by 16. For a safety margin, the estimate
-                # assumes that it divides the error by 4.
+                # Halving the steps divides the error by 16, so the remaining error is about 1/15 of
+                # the change. For a safety margin, the estimate is 1/4 of the change.
                 apart = np.abs(each[1] - found[k][1]).max(axis=0)
                 if not (0.25 * apart <= _ACCURACY * np.abs(each[1]).max(axis=0)).all():
                     pending.append(k)

@@ -48,7 +48,7 @@ class Prepared:
     own_reference : bool
         Whether the reference is the base placement at each point.
     free : bool
-        Whether `common` and `rest` contain all matrices except B, if a model is at rest at its
+        Whether `common` and `rest` contain all matrices, except B, of a model at rest at its
         reference.
     common : dict
         Fields of a model that are the same at all points.
@@ -128,10 +128,10 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # A coordinate is ignorable if the dynamics do not depend on it. The position of the base is
-    # ignorable, because uniform gravity is the same everywhere. Without gravity, the attitude
-    # relative to a moving reference (`lin.moving`) is ignorable too. In orbit, the dynamics depend
-    # on the position and on the attitude.
+    # A coordinate is ignorable if the dynamics do not depend on it. In orbit, the dynamics depend
+    # on the position and the attitude of the base. For other robots, the position is ignorable,
+    # because gravity is zero or uniform. If gravity is zero, the attitude relative to a moving
+    # reference (`lin.moving`) is ignorable too.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
@@ -237,9 +237,9 @@ class Linearizer:
             slow["placement"] = partial(own_reference, robot)
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether only B must be computed for a model at rest. The inputs, the outputs and the
-        # reference must then be the default ones, and the robot must have no springs, gravity,
-        # orbit or stored momentum.
+        # Whether B is the only matrix to be computed for a model at rest. This requires the default
+        # inputs, outputs and reference, and a robot without springs, gravity, orbit and stored
+        # momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -259,7 +259,7 @@ class Linearizer:
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
-            # Suppress NumPy's warnings of an overflow, because `_require_finite` reports it.
+            # Suppress NumPy's overflow warnings, because `_require_finite` reports an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
@@ -335,7 +335,7 @@ class Linearizer:
 
 
 def _require_finite(*arrays: Array) -> None:
-    """Raise `InputError` if an array contains NaN or its sum of squares is not below `LARGEST`."""
+    """Raise `InputError` if an array contains NaN, or its squared norm is at least `LARGEST`."""
     for array in arrays:
         if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(

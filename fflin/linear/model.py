@@ -170,9 +170,10 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     drift: Array | None = None
-    # For a model that was made from another model: the fingerprint of the new model, and the other
-    # model. The certificate is computed from the other model. The matrices of the other model also
-    # have exact zeros, which the matrix exponential of a discretisation does not preserve.
+    # Only for a discretised model or a model from a file: the fingerprint of this model, and the
+    # source, which has the certificate. The source of a discretised model is the continuous-time
+    # model, whose exact zeros are lost in the matrix exponential. The source of a model from a file
+    # is the same model as read from the file.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None

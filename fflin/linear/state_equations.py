@@ -43,8 +43,8 @@ def assemble(
     theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Write the rows of attitude and position. If the base is at the reference, the other blocks of
-    # these rows are the same as at rest (2.1).
+    # Write the rows of attitude and position. If the base is at the reference, the blocks of these
+    # rows for the velocities are the same as at rest (2.1), and need not be written.
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
@@ -89,9 +89,10 @@ def assemble(
 def _over_rotations(
     actuation: Actuation, chart: Chart, u: Array, rates: AccelerationDerivatives, W: Array
 ) -> Array:
-    """Return the derivative (.., 6 + n, 3) of the accelerations over base rotations (4.4).
+    """Return the derivative of the accelerations with respect to base rotations (4.4).
 
-    The function may change `rates.by_turn`, because it adds terms in place.
+    The shape of the derivative is (.., 6 + n, 3). The function may change `rates.by_turn`, because
+    it adds terms in place.
     """
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
@@ -102,8 +103,8 @@ def _over_rotations(
         theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # Change the parts through views with names: `theta[part] -= y` would also copy the result back
-    # into theta, which takes time.
+    # Change the angular and the linear rows through views with names: `theta[rows] -= y` would also
+    # copy the result back into theta, which takes time.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
         turning -= skew(c[..., ANGULAR])

@@ -46,7 +46,10 @@ TOOLS = {
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of a tool's x' over y (15.1), and of u in base axes over the tool's u' and y."""
+    """Derivatives of a tool's x' with respect to y (15.1), and of u with respect to u' and y.
+
+    u is in base axes, and u' is in the axes of the tool.
+    """
 
     P: Array  # dx'/dy (15.2)
     rate: Array  # time derivative of P along the motion
@@ -160,8 +163,8 @@ class ToolCoordinates:
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude of the tool's base as a quaternion x, y, z, w and as a matrix.
 
-        The attitude is relative to the reference. For fflin's own coordinates relative to a moving
-        reference, it is the identity.
+        The attitude is relative to the reference. In fflin's own coordinates relative to a moving
+        reference, the attitude is the identity.
         """
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
@@ -173,7 +176,7 @@ class ToolCoordinates:
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
         """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes.
 
-        If `rates` is True, the matrix converts omega to the rates of the Euler angles.
+        If `rates` is True, the angular block converts omega to the rates of the Euler angles.
         """
         rotation = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
         if rates:
@@ -181,10 +184,11 @@ class ToolCoordinates:
         return rotation
 
     def _held(self, parts: Array) -> Array:
-        """Return the derivative (6, 3) of two vectors in base axes over a base rotation (4.4).
+        """Return the derivative (6, 3) of two vectors with respect to a base rotation (4.4).
 
-        A vector whose components the tool gives in world axes is constant in the world. Its
-        components in base axes then depend on the rotation. Other vectors have the derivative zero.
+        The components of both vectors are in base axes. If the tool gives a vector in world axes,
+        it is constant in the world, and its components in base axes depend on the rotation. If the
+        tool gives it in base axes, the derivative is zero.
         """
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
@@ -212,7 +216,7 @@ class ToolCoordinates:
             if kind.attitude == "wxyz":
                 attitude = np.vstack((-0.5 * vec, attitude))
         k = len(attitude) + 3
-        base = np.zeros((k + 6, 12), dtype=complex)  # over (theta, p), (omega, v)
+        base = np.zeros((k + 6, 12), dtype=complex)  # columns: theta, p, omega, v
         base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
         if kind.attitude == "pose":
             base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
@@ -251,7 +255,7 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement of a frame on the root link: at its centre of mass, in inertia axes."""
+    """Return the placement on the root link of its centre of mass, with the axes of its inertia."""
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):
@@ -262,7 +266,7 @@ def _centre(robot: Robot) -> pin.SE3:
 def _joint_path(robot: Robot, name: str) -> list[int]:
     """Return the index in the URDF of each joint on the path from the root to a joint.
 
-    A joint that is not in the URDF gets an index after the last one.
+    A joint that is not in the URDF gets an index after the last joint of the URDF.
     """
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
@@ -294,7 +298,7 @@ def _angles(R: Array) -> Array:
 
 
 def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-    """Return G of de/dt = G omega for the Euler angles e, and the derivative of G omega over e."""
+    """Return G of de/dt = G omega for the Euler angles e, and the derivative d(G omega) / de."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega

@@ -48,11 +48,12 @@ _CAUSES = (
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
 # Rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest position.
-# An acceleration is a sum of terms. _SUM_ROUNDING is its error, relative to the largest term.
+# An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to the sum of
+# the magnitudes of the terms.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# A time counts as the time of a knot if the difference is less than this fraction of the interval.
+# A time counts as the time of a knot if the two differ by less than this fraction of the interval.
 _NEAR = 1e-9
 
 

@@ -142,8 +142,9 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
     if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
         inertia = inertia[:, :1] * np.ones(3)
-    # If the affine map T is applied to the mass distribution, P becomes T P T^T, which is positive
-    # semidefinite if P is. Here, T stretches the body about its centre of mass, then shifts it.
+    # If the affine map T is applied to the mass distribution, P becomes T P T^T. This matrix is
+    # positive semidefinite if P is. Here, T stretches the body about its centre of mass, and then
+    # shifts it.
     T = np.zeros((len(com), 4, 4))
     T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
     T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever

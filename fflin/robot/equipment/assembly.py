@@ -277,8 +277,8 @@ def _mounted_wheels(
         rest = bodies[joint] - spinning
         moments = np.linalg.eigvalsh(rest.inertia).tolist()
         about = float(axis @ bodies[joint].inertia @ axis)
-        # Also refuse a wheel whose inertia equals the inertia of the link up to rounding errors,
-        # because the link is then the wheel itself.
+        # Also refuse a wheel whose inertia is, up to rounding errors, the whole inertia of the link
+        # about the wheel's axis. Such a link is the wheel itself.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
             lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
