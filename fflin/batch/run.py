@@ -189,7 +189,7 @@ def _results(
                     running[submit(*span)] = span
                 except Exception as error:  # broken, shut down, or specific to the executor
                     yield span, _reason(error)
-            ready = list(running)[:1]  # chunks of this process end in order
+            ready = list(running)[:1]  # wait for the chunks of this process in order
             if not inside:
                 ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
             for future in ready:

@@ -244,7 +244,7 @@ class ChunkJob:
         return [str(note.message) for note in caught]
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write results into `out` by compiled code; return the indices of rows that it skips."""
+        """Write results into `out` by compiled code; return the indices of the skipped rows."""
         kernel, q = self._kernel, rows["q"]
         count = len(q)
         if kernel is None:
@@ -337,7 +337,7 @@ class SweepTask:
         }
         if not prepared.own_reference:
             constants["_reference"] = prepared.common["placement"]
-        # Value of each array that is the same at all points.
+        # {array: value}, for the arrays that are the same at all points.
         self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:

@@ -222,7 +222,7 @@ class Dispersions:
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
         # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-        if isinstance(column.inverse, partial):  # a closed form of `spreads`
+        if isinstance(column.inverse, partial):  # a fast function of `spreads`
             return column.inverse(uniform)
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
@@ -388,7 +388,7 @@ class Dispersions:
             policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
-            if isinstance(policy, Allocation):  # allocates to the nominal directions
+            if isinstance(policy, Allocation):  # it allocates to the nominal directions
                 nominal = bound(policy, plant.robot)
                 policy = _Bound(lambda _: nominal)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)

@@ -30,7 +30,7 @@ from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
-_ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
+_ROUNDING = 1e-12  # eigenvalues of P up to this fraction of the largest count as zero
 
 # The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
 # root of the level at most _HALVINGS times.

@@ -85,7 +85,7 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
     """
     try:
         document = TomlFile(as_path(path))
-    except InputError as error:  # q_b = 1 and q_b.sensor = 1 are a number and a table
+    except InputError as error:  # for example, q_b = 1 and q_b.sensor = 1
         hint = '; put names that contain dots in quotes, "q_b.sensor"' * ("overwrite" in str(error))
         raise InputError(f"{error}{hint}") from None
     table = document.record.get(_TABLE)

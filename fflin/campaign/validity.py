@@ -23,7 +23,7 @@ from fflin.robot.robot import Robot
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-_MOST = 1_000_000  # random runs
+_MOST = 1_000_000  # largest number of random runs
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
 TRUSTED = 0.1  # largest accepted relative prediction error
 

@@ -90,7 +90,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             "base": (fflin.BaseTorque(), fflin.BaseForce()),
         }
         found = bundled.get(inputs) or fflin.load_inputs(inputs)
-        with located(inputs):  # a name or an inertia that this robot does not accept
+        with located(inputs):  # errors about a name or an inertia show the file
             robot = robot.replace(inputs=found)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs

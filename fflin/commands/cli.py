@@ -251,7 +251,8 @@ def kind_of(path: Path) -> str:
             with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
                 names, kind = {*entries}, text(entries.get("kind", ""))
         else:
-            entries, _ = CODECS[path.suffix][1](path.read_bytes())  # `read_file` registers an input
+            # Do not call `read_file`, because it would register the file as an input.
+            entries, _ = CODECS[path.suffix][1](path.read_bytes())
             names, kind = {*entries}, text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types
         return ""
