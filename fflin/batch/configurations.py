@@ -266,8 +266,8 @@ def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Confi
     The rows of the array (N, nq) are corrected so that they satisfy `Robot.checked_configuration`.
     """
     if isinstance(q, Grid | RandomConfigurations):
-        # The points may be made for a robot with other inputs or outputs, but its joints must be
-        # equal.
+        # The points may have been made for a robot with other inputs or outputs, but with the same
+        # joints.
         if q.robot.joints != robot.joints:
             raise InputError(
                 f"q was made for '{q.robot.name}', whose joints differ from the joints of "
@@ -281,7 +281,8 @@ def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Confi
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-        # Comparisons with NaN are false, so rows with NaN count as doubtful.
+        # Rows that may be invalid. They include rows with NaN, because comparisons with NaN are
+        # false.
         doubtful = ~((excess <= ROUND_OFF) & np.isfinite(block).all(axis=1))
         if robot.followers:
             followed = block.copy()
@@ -306,9 +307,9 @@ def checked_rows(
 ) -> Array:
     """Return a read-only array (count, size) with one row for each point.
 
-    The argument `given` is such an array, or a single row (size,) for all points. The function
-    `check` must raise an error for an invalid row. It is called for a single row. For an array, it
-    is called for each row with an entry that is not finite, or for all rows if `every` is true.
+    The argument `given` is an array (count, size), or a single row (size,) for all points. The
+    function `check` must raise an error for an invalid row. A single row is always checked. The
+    rows of an array are checked if they have an entry that is not finite, or if `every` is true.
     """
     if validation.dimension(name, given) == 1:
         return np.broadcast_to(check(given).copy(), (count, size))

@@ -1,9 +1,9 @@
 """Storage of arrays with many rows: memory, .npz files, and HDF5 files that are read on demand.
 
 An HDF5 file has one dataset per array, and two datasets of checksums. ``chunk_sha256`` contains the
-checksum of each chunk of rows; the attribute ``chunk`` is the number of rows in a chunk.
-``sha256`` contains the checksum of all other content: ``chunk_sha256``, ``chunk``, the constant
-arrays, and all strings except ``request``.
+checksum of each chunk of rows; the file attribute ``chunk`` is the number of rows in a chunk.
+``sha256`` contains one checksum of ``chunk_sha256``, ``chunk``, the constant arrays, and all
+strings except ``request``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def hdf5() -> ModuleType:
 
 
 def is_constant(array: Array) -> bool:
-    """Return whether an array stores a single row that represents all its rows."""
+    """Return whether all rows of an array are views of one stored row."""
     return array.strides[0] == 0 and array.size > 0
 
 
@@ -62,7 +62,7 @@ def write_rows(
 ) -> None:
     """Write `arrays`, which have equal numbers of rows, and the strings `texts` to a file.
 
-    If `checksummed`, the file also gets checksums.
+    If `checksummed` is true, the file also contains checksums.
     """
     writing.check_ending(path, FORMATS)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
@@ -189,7 +189,7 @@ class MemoryStore:
             ) from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Return False, because no chunk in memory is finished before the run starts."""
+        """Return False, because memory contains no chunks of an earlier call."""
         return False
 
     def read(self, stop: int) -> dict[str, Array]:

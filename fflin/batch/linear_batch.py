@@ -117,7 +117,7 @@ class LinearBatch(validation.Result):
     _root: Array
     _drift: Array | None
     # Further fields of each `LinearModel`: values that are the same at all points, and functions
-    # that compute a field from the robot when it is read.
+    # that compute a field from the robot when the field is read.
     _asked: Mapping[str, object]
     verified: bool = True
 
@@ -379,9 +379,10 @@ def _checked_fields(
 
 
 def _apart(at: Array, turning: bool, value: float) -> Array:
-    """Return the distances (N,) of the joint positions `at` from `value`.
+    """Return the distances (N,) between a joint's positions, `at` (N,), and the position `value`.
 
-    If `turning`, the joint is continuous, and the distance is the shorter arc between two angles.
+    If `turning` is true, the joint is continuous, and the distance is the shorter arc between the
+    two angles.
     """
     distance = at - value
     if turning:

@@ -1,7 +1,8 @@
-"""Run a job on chunks of rows, and save the results in a store that may contain finished chunks.
+"""Run a job on chunks of rows, and save the results in a store.
 
 Chunks are computed by threads of this process, by worker processes that `Execution` starts, or by
-the workers of a given executor. The job defines the content of the rows and of the results.
+the workers of a given executor. The job defines the content of the rows and of the results. Chunks
+that the store contains from an earlier call are not computed again.
 """
 
 from __future__ import annotations
@@ -119,9 +120,10 @@ def run_chunks(
     The store saves the rows and results for which it has arrays. Only chunks that begin before row
     `upto` are computed.
 
-    If a chunk fails, the other chunks are still computed, and then `SweepError` is raised. If the
-    store is in memory, `made` converts the rows and results of the other chunks to the attribute
-    `batch` of this error. Without `made`, the first failure ends the call with `FflinError`.
+    If the function `made` is None, the first chunk that fails ends the call with `FflinError`. If
+    `made` is given, all other chunks are still computed, and `SweepError` is raised at the end. If
+    the store is in memory, `made` is called with the rows and results of the other chunks, and
+    returns the attribute `batch` of this error.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):
@@ -187,7 +189,7 @@ def _results(
                     running[submit(*span)] = span
                 except Exception as error:  # broken, shut down, or specific to the executor
                     yield span, _reason(error)
-            ready = list(running)[:1]  # chunks of this process end in order
+            ready = list(running)[:1]  # wait for the chunks of this process in order
             if not inside:
                 ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
             for future in ready:
@@ -203,7 +205,8 @@ def _results(
         for future in running:
             future.cancel()
         if inside:
-            # Do not wait for the threads. Then Ctrl-C ends the call even while a thread compiles.
+            # Do not wait for the threads, so that Ctrl-C ends the call even while a thread is
+            # compiling the kernel.
             pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -289,9 +292,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        # Do not join the threads, because a join could block forever. If Ctrl-C interrupts a wait
-        # for a future, the future can stay locked. The thread that sets the result of this future
-        # then never ends. All other threads end when their processes end.
+        # Do not join the threads, because a join could block forever: if Ctrl-C interrupts a wait
+        # for a future, the future can stay locked, and the thread that sets its result never ends.
+        # All other threads end when their processes end.
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
             self._ended = "the workers have been shut down"
@@ -340,8 +343,8 @@ class OwnWorkers(futures.ThreadPoolExecutor):
 
 
 # Lock for `_starting` and `_unpickled`, which only one thread at a time may execute. `_starting`
-# replaces a function of multiprocessing, and `_unpickled` changes the warning filters. All threads
-# share this function and these filters.
+# replaces a function of multiprocessing, and `_unpickled` changes the warning filters. Both changes
+# affect all threads.
 _TURN = Lock()
 
 
@@ -350,8 +353,8 @@ def _starting() -> Iterator[None]:
     """Return a context in which new processes ignore Ctrl-C and modules in the working folder.
 
     By default, a process that multiprocessing starts looks for modules in the working folder first,
-    until it has copied `sys.path` from its parent process. Worker processes need no Ctrl-C, because
-    the parent process also receives it and ends its workers.
+    until it has copied `sys.path` from its parent process. Worker processes can ignore Ctrl-C,
+    because the parent process also receives it and then ends its workers.
     """
     from multiprocessing import resource_tracker, util
 

@@ -196,7 +196,8 @@ class ChunkJob:
     """Job that linearises chunks of points with `Linearizer`.
 
     The rows of a chunk contain the configurations q. They also contain v if velocities are given,
-    and u0 if inputs are given. If neither is given, the caller sets `at_rest`.
+    and u0 if inputs are given. If neither velocities nor inputs are given, the caller sets
+    `at_rest`.
     """
 
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
@@ -243,7 +244,7 @@ class ChunkJob:
         return [str(note.message) for note in caught]
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
-        """Write results into `out` by compiled code; return the indices of rows left to Python."""
+        """Write results into `out` by compiled code; return the indices of the skipped rows."""
         kernel, q = self._kernel, rows["q"]
         count = len(q)
         if kernel is None:
@@ -288,7 +289,8 @@ class ChunkJob:
         if ready.moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
         # Comparisons with NaN are false, so rows with NaN are not valid. The upper half of A is not
-        # checked, because it is finite if f0 and the quaternion's scalar part q0 are valid.
+        # checked, because it is finite if f0 is finite and the quaternion's scalar part q0 is not
+        # close to zero.
         good = good & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
         for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
             good &= np.vecdot(values, values) < LARGEST
@@ -335,7 +337,7 @@ class SweepTask:
         }
         if not prepared.own_reference:
             constants["_reference"] = prepared.common["placement"]
-        # Value of each array that is the same at all points.
+        # {array: value}, for the arrays that are the same at all points.
         self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:

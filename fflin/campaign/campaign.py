@@ -45,7 +45,7 @@ _FACTORS = {  # from the unit of a condition to the unit of a figure
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and the mask (N,) of runs that meet the comparison."""
+    """Comparison in a condition, and the mask (N,) of runs that satisfy the comparison."""
 
     name: str
     sign: str
@@ -56,7 +56,7 @@ class Bound(NamedTuple):
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
     """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
 
-    The function `figure` returns the values (N,) of a named quantity, and its unit.
+    The function `figure` returns the values (N,) and the unit of a named quantity.
     """
     bounds = []
     for part in condition.split(" and "):

@@ -111,7 +111,8 @@ class Dispersions:
         self.names = tuple(map(attrgetter("name"), self.columns))
         # Cached values of slow distributions: {(name, block of runs): values}.
         self._kept: dict[tuple[str, int], Array] = {}
-        # A mass must not be dispersed twice, such as for a link and for the whole body of the link.
+        # The same mass must not be dispersed twice, for example for a link and for the whole body
+        # that contains the link.
         pieces = [*robot.pieces.values()]
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
@@ -127,8 +128,8 @@ class Dispersions:
         """Add the columns of one kind of dispersion.
 
         `spreads` is {name or pattern: (inverse distribution function, common name)}. If the common
-        name is not empty, all names of the pattern share one value of this name. `kinds` is a text
-        for error messages.
+        name is not empty, all quantities that match the pattern share one random variable, which
+        has this name. `kinds` is the list of kinds in error messages.
         """
         robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
@@ -221,7 +222,7 @@ class Dispersions:
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
         # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-        if isinstance(column.inverse, partial):  # a closed form of `spreads`
+        if isinstance(column.inverse, partial):  # a fast function of `spreads`
             return column.inverse(uniform)
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
@@ -346,8 +347,8 @@ class Dispersions:
                 body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
                 old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
-                # The parameters of a body in the tree include its wheels, but `body` and `before`
-                # do not. So only the difference of these two is added to the parameters.
+                # `parameters` include the wheels of a body, but `body` and `before` do not.
+                # Therefore only the change from `before` to `body` is added to `parameters`.
                 parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
@@ -387,7 +388,7 @@ class Dispersions:
             policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
-            if isinstance(policy, Allocation):  # allocates to the nominal directions
+            if isinstance(policy, Allocation):  # it allocates to the nominal directions
                 nominal = bound(policy, plant.robot)
                 policy = _Bound(lambda _: nominal)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
@@ -397,16 +398,16 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Policy whose method `bind` is a given function; `lin` is the model of its design."""
+    """Policy with a given function as its method `bind`; `lin` is the model of its design."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None
 
 
 def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
-    """Return `policy` with a bias and white noise in the states or outputs (ny,) that it reads.
+    """Return a copy of a policy that reads its states or outputs (ny,) with a bias and white noise.
 
-    `deviation` is the standard deviation of the noise.
+    `deviation` (ny,) contains the standard deviations of the noise.
     """
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
@@ -464,7 +465,7 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     """Return the arrays of the compiled loop that change with misalignment angles (N, nu, 2).
 
     The arrays contain the wrenches of the inputs, the stored momenta, the joint placements, and the
-    changes of the body parameters. Each has one row per run.
+    changes of the body parameters. Each array has one row per run.
     """
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)

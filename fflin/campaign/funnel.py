@@ -30,7 +30,7 @@ from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
-_ROUNDING = 1e-12  # eigenvalues of P, relative to the largest, that count as zero
+_ROUNDING = 1e-12  # eigenvalues of P up to this fraction of the largest count as zero
 
 # The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
 # root of the level at most _HALVINGS times.
@@ -388,8 +388,8 @@ def _outcomes(
 ) -> dict[str, Array]:
     """Return {"outcome": codes (N,)} of runs; `Funnel` lists the codes.
 
-    `final` contains bounds of the final errors, and `within` contains bounds of the errors at all
-    times. The level of a final error e is e' P e.
+    `final` is {kind: largest final error}, and `within` is {kind: largest error at any time}. The
+    kind "level" is e' P e, where e (nx,) is the final state error.
     """
     e = runs["state_errors"][:, -1]
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
@@ -404,10 +404,12 @@ def _outcomes(
 def _tested(
     job: CampaignJob, P: Array, samples: int, rng: np.random.Generator, how: Execution
 ) -> tuple[float, Array]:
-    """Return the largest level tested at a knot, and the outcomes (samples,) up to that level.
+    """Return the largest level tested at a knot, and the outcomes (samples,) of the runs.
 
-    The largest level is chosen such that about one run in 16 fails at this level. The level of an
-    error e is e' P e.
+    The level of an initial error e is e' P e. The runs start at levels between zero and the largest
+    level. The largest level is the smallest trial level at which at least one of 16 trial runs
+    fails. If no trial run fails, it is the level whose ellipsoid reaches a bound of the initial
+    errors.
     """
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
@@ -426,10 +428,10 @@ def _tested(
         np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
         *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
     ]
-    # `root` is the square root of a level. If it is `widest`, the ellipsoid of this level reaches
-    # one of the largest initial errors.
+    # `root` is the square root of a level. `widest` is the square root of the level whose ellipsoid
+    # reaches one of the largest initial errors.
     root = widest = float(1.0 / max(reach))
-    # If the run without an initial error already misses the goal, the widest level is tested.
+    # If even the run without an initial error fails, the search is skipped.
     if not simulate(np.zeros(1)).any():
         for _ in range(_HALVINGS):
             if not simulate(np.full(_PILOTS, root)).any():

@@ -299,7 +299,7 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 
 def _header(job: CampaignJob) -> dict[str, object]:
-    """Return the header of a campaign: the fields that are not arrays and follow from its job."""
+    """Return the header of a job's campaign: the fields that the job defines, except arrays."""
     plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
     fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
     for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):

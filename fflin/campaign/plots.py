@@ -117,8 +117,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     percent = 100.0
     with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
-        # The figure shows the error relative to the displacement. The order of this relative error
-        # is one less than the order of the absolute error.
+        # The figure shows the error divided by the displacement. Therefore its exponent is one less
+        # than the exponent `slope` of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
@@ -207,9 +207,9 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw values (N, M) over time: bands of the runs `of`, and one line for each of `runs`."""
-    # Infinite values of stopped runs are drawn at the upper edge of the axes. Each bound of a band
-    # is the value of one run, because interpolation could mix finite values with this edge.
+    """Draw values (N, M) over time: one line for each of `runs`, and bands of the runs in `of`."""
+    # Infinite values of stopped runs are drawn at the upper edge of the axes. The quantiles are not
+    # interpolated between runs, because a mean of a finite value and the edge has no meaning.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:

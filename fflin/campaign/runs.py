@@ -50,8 +50,8 @@ KINDS = {
 }
 # Attitude error [deg] above which a run counts as having left the chart. The chart ends at 180 deg.
 EDGE = 176.0
-# LOOK is the number of steps between checks of the condition `over`. Without such a condition, one
-# call of the compiled loop computes up to _LONG steps.
+# LOOK is the number of steps between checks of the condition `CampaignJob.over`. If this condition
+# is None, one call of the compiled loop computes up to _LONG steps.
 LOOK, _LONG = 64, 2**20
 
 _LARGEST_CHUNK = 256
@@ -88,7 +88,8 @@ def kinds_of(state: StateMap) -> Indices:
     """Return the index into KINDS of each state (nx,).
 
     The index is -1 for the angles of wheels, whose errors are not counted. The index is 0 for the
-    attitude and for all states without a kind: modes and wheel speeds.
+    attitude and for the states without a kind, which are modes and wheel speeds. States with index
+    0 do not affect the error of any kind, because the attitude error is the rotation angle.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
     groups, wheels, modes = state.groups, state.robot.wheels, state.robot.modes
@@ -106,8 +107,9 @@ class CampaignJob:
     """Job that simulates runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
     If `given` is None, the drawn values are the deviations (nx,) of the initial state. The function
-    `judge` returns the arrays of the result. The condition `over` can end runs early. It needs
-    histories, because it reads the initial errors from their first entry.
+    `judge` computes the arrays of the result from the outcomes. A run ends early if it satisfies
+    the condition `over`. This condition is possible only with histories, because the initial errors
+    are read from the first entry of the histories.
     """
 
     def __init__(
@@ -154,8 +156,8 @@ class CampaignJob:
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
         # `outcome_shapes` contains the shape of each array of an outcome, and `shapes` the shape,
-        # per run, of each array that `judge` returns. The outcome of a run without steps shows
-        # these shapes.
+        # per run, of each array that `judge` returns. They are read from the outcome of a run of
+        # zero steps.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
         outcome = self.outcome(none)
@@ -357,19 +359,25 @@ class RunStatistics(lanes.Statistics):
             values[:] = initial
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of runs that `CampaignJob.over` ends at q and v (LANES, ..)."""
+        """Return the mask (LANES,) of runs to end at q and v (LANES, ..); see `CampaignJob`."""
         over, first = self._job.over, _by_run(self._marks.states[: self._state.nx])
         return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
 
     def add(self, first: int, rows: Array) -> None:
-        """Add steps from step `first` on; `rows` (steps, width, LANES) begins with q, nu and u."""
+        """Add consecutive steps to the statistics; the first of them has the index `first`.
+
+        `rows` (steps, width, LANES) contains q, nu and u, in this order, and further values.
+        """
         take = kernel("loop", "take")
         take(self._words, rows.reshape(-1, LANES), first, len(rows))
         sizes = map(len, (self._marks.at.q, self._marks.at.nu, self._marks.largest_u))
         self._last = np.split(rows[-1].T, np.cumsum(list(sizes)), axis=1)[:3]
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes of eight runs after `done` steps; `stop` has indices into `STOPS`."""
+        """Return the outcomes of eight runs after `done` steps.
+
+        `stop` (LANES,) contains the indices into `STOPS` of the reasons why the runs ended.
+        """
         (q, nu, u), marks, times = self._last, self._marks, len(self._job.steps)
         settled = _by_run(marks.outside) + 1.0
         late = (stop != 0.0)[:, None] | is_late(settled, done + 1)
@@ -398,7 +406,7 @@ def _by_run(values: Array, *shape: int) -> Array:
 
 
 def _recorded(plan: Plan, every: int) -> Recording:
-    """Simulate a run in Python, and record a row every `every` steps."""
+    """Simulate a run in Python, and record one row per `every` steps."""
     run = go(plan.replace(times=plan.times._replace(every=every)))
     if run.stopped.startswith("interrupted"):
         raise KeyboardInterrupt

@@ -88,9 +88,10 @@ class Loop:
 
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # `of` and `size` contain square roots of weights. The root for a coordinate is the root for
-        # its velocity times the decay rate of the loop. The model can contain a velocity without
-        # its coordinate.
+        # `of` contains the square roots of the weights of velocities, and `size` those of the
+        # weights of coordinates. The root for a coordinate is the root for its velocity times the
+        # decay rate of the loop. Coordinates and velocities are matched by name, because a velocity
+        # can be a state of the model even if its coordinate is not.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
@@ -130,14 +131,14 @@ class Loop:
     ) -> CampaignJob:
         """Return a job that simulates the loop from displaced states.
 
-        A run ends when it settles or diverges, or after PATIENCE settling times. With `predicts`, a
-        run always lasts _CONSTANTS time constants, and is compared with the linear loop. `joint` is
-        the largest displacement of a joint [rad|m]. `fine` states how often diverging runs have
-        been repeated with shorter steps.
+        A run ends when it settles or diverges, or after PATIENCE settling times. If `predicts` is
+        true, a run always lasts _CONSTANTS time constants, and is compared with the linear loop.
+        `joint` is the largest displacement of a joint [rad|m]. `fine` is the number of times that
+        the steps are shortened by the factor _FINER.
         """
         lin, decay = self.lin, self.decay
-        # The step is also limited by the poles of the open loop, because the loop is open between
-        # samples and at saturation.
+        # The step depends on the poles of both the closed and the open loop, because the loop is
+        # open between samples and at saturation.
         free = linearize(self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
         rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
         fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)

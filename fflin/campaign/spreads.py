@@ -85,7 +85,7 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
     """
     try:
         document = TomlFile(as_path(path))
-    except InputError as error:  # q_b = 1 and q_b.sensor = 1 are a number and a table
+    except InputError as error:  # for example, q_b = 1 and q_b.sensor = 1
         hint = '; put names that contain dots in quotes, "q_b.sensor"' * ("overwrite" in str(error))
         raise InputError(f"{error}{hint}") from None
     table = document.record.get(_TABLE)
@@ -161,9 +161,10 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
 def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     """Return the inverse distribution function of a spread.
 
-    A number is the standard deviation of a normal distribution; if `fixed`, it is the value of all
-    runs. A function of this module is returned as a `partial` object. Otherwise, the method `ppf`
-    of the distribution is returned, which can be slow.
+    A number is the standard deviation of a normal distribution; if `fixed` is true, the number
+    itself is the value in all runs. For a distribution of scipy.stats, the method `ppf` is
+    returned, which can be slow. For any other spread, a function of this module is returned as a
+    `partial` object.
     """
     if hasattr(spread, "ppf"):
         try:

@@ -23,7 +23,7 @@ from fflin.robot.robot import Robot
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-_MOST = 1_000_000  # random runs
+_MOST = 1_000_000  # largest number of random runs
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
 TRUSTED = 0.1  # largest accepted relative prediction error
 
@@ -250,8 +250,7 @@ def validity(
     )
     total = len(first) + samples
     with how:
-        # A random run usually ends early, because it settles after 1 / PATIENCE of its largest
-        # duration.
+        # A random run usually settles, and ends, after about 1 / PATIENCE of its largest duration.
         few = math.ceil(samples / PATIENCE)
         expect(progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
         told = progress and partial(_report, progress, 0, total)
@@ -286,10 +285,11 @@ def _report(progress: Progress, before: int, total: int, done: int, _: int) -> N
 
 
 def _slope(errors: Array) -> float:
-    """Return the order of the absolute error in the displacement, or NaN if it is unknown.
+    """Return the exponent k for which the absolute error grows as displacement^k, or NaN.
 
-    The order is one more than the order of the relative error, which is fitted to the four smallest
-    levels. It is unknown if an error at these levels is not larger than integration errors.
+    The exponent of the relative error is fitted to the four smallest levels; k is one more than
+    this exponent. The result is NaN if one of these errors is NaN or as small as the integration
+    error.
     """
     if not errors[:4].min() > _ROUNDING:
         return np.nan
@@ -303,8 +303,9 @@ def _crossing(errors: Array) -> float:
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # The error cannot be interpolated below the first level, or if a run at the next level
-        # failed. In these cases, it is assumed to be proportional to the level.
+        # The error cannot be interpolated below the first level, or if a run at level `first` left
+        # the chart or diverged. In these cases, the error is assumed to be proportional to the
+        # level.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0
@@ -347,7 +348,7 @@ def joint_unit(lin: LinearModel) -> str:
 
 
 def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:
-    """Describe the nonzero parts of a displacement."""
+    """Format a displacement; entries that are zero are omitted."""
     units = {"attitude": "deg", "position": "m", "joint": of_joints}
     words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

@@ -90,7 +90,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             "base": (fflin.BaseTorque(), fflin.BaseForce()),
         }
         found = bundled.get(inputs) or fflin.load_inputs(inputs)
-        with located(inputs):  # a name or an inertia that this robot does not accept
+        with located(inputs):  # errors about a name or an inertia show the file
             robot = robot.replace(inputs=found)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs
@@ -210,7 +210,7 @@ def model_about(
 
 
 def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
-    """Return q (nq,) and the base placement of the relative equilibrium `number`, from 1 to 24."""
+    """Return q (nq,) and the base placement of a relative equilibrium; `number` is 1 to 24."""
     import pinocchio as pin
 
     q = fflin.relative_equilibria(robot, q, frame=frame)[number - 1].q
@@ -232,10 +232,10 @@ def robot_of_design(
     allocate: bool | None,
     law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
 ) -> fflin.Robot:
-    """Return the robot of a design; for allocation, a base torque and force replace thrusters.
+    """Return the robot for a design; for allocation, base torque and force replace the thrusters.
 
     If `allocate` is None, thrusters are allocated under two conditions: they can produce every
-    wrench on the base, and the given `law`, if any, commands a base torque.
+    wrench on the base, and `law` commands a base torque or is None.
     """
     if allocate is None:
         from fflin.control.authority import thrusters_give_every_wrench
@@ -258,7 +258,7 @@ def robot_of_design(
 def designed(
     arguments: Namespace,
 ) -> tuple[fflin.Robot, fflin.Robot, fflin.LinearModel, fflin.Gain]:
-    """Return the robot, the robot of the design, its linear model, and the model's regulator."""
+    """Return the robot, the robot for the design, and the linear model and gain of the design."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
     lin = model_about(design, arguments, *point_of(design, arguments))
@@ -346,7 +346,8 @@ def about_point(
     """Return the policy about a point, its linear feedback, and the model that predicts the motion.
 
     The model is None for MPC, for a reduced model, for a controller from a file, and for allocated
-    thrusters. `simulate` then predicts with the policy's own model, or does not predict.
+    thrusters. In these cases, `simulate` predicts the motion with the policy's own model if it can,
+    and otherwise makes no prediction.
     """
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
@@ -389,8 +390,8 @@ def about_point(
 def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
     """Return the linear model about the point for which a gain was designed.
 
-    If the gain was designed with the base at its reference, the target pose of the base is the new
-    reference. Otherwise, the reference of the gain is used.
+    If the base pose of the gain's operating point is the reference of the gain, the new reference
+    is the target pose of the base. Otherwise, the reference of the gain is used.
     """
     import pinocchio as pin
 

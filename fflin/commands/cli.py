@@ -43,7 +43,7 @@ _CONTROL = "lqr tvlqr plan simulate export montecarlo validity funnel sweep"
 # For files with these endings, the report shows the file size.
 _PAGES = (".html", ".gif")
 
-# Entries by which the kind of a result is recognised if its file does not state the kind.
+# Entries by which the class of a result is recognised if its file does not state the class.
 _ENTRIES = {
     "Sensitivity": {"urdf_sha256", "dA", "dB"},
     "LinearModel": {"urdf_sha256", "certificate"},
@@ -167,8 +167,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             }
             result = plain(report.result)
             assert isinstance(result, dict)
-            # The entries of `head` come first, and an entry of the result with the same name does
-            # not replace them.
+            # The entries of `head` come first, and they override entries of the result with the
+            # same names.
             print(json.dumps(head | result | head, allow_nan=False))
         else:
             lines = [headed(command, report.text)]
@@ -202,7 +202,7 @@ def plain(value: object) -> object:
         value = record_of(value)
     elif is_dataclass(value):
         own = {each.name: getattr(value, each.name) for each in fields(value)}
-        # Omit the linear models in a result, because each is a result of its own.
+        # Omit linear models that a result contains, because `fflin linearize` prints such models.
         value = {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
     elif hasattr(value, "_asdict"):
         value = value._asdict()
@@ -214,7 +214,7 @@ def plain(value: object) -> object:
 
 
 def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
-    """Raise `FileError` if `path` is a file that contains no result of one of these kinds."""
+    """Raise `FileError` if a file exists and contains no result of the given `kinds`."""
     if path.suffix == ".csv" and "LinearModel" in kinds:
         from fflin.linear.files import foreign_table
 
@@ -251,7 +251,8 @@ def kind_of(path: Path) -> str:
             with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
                 names, kind = {*entries}, text(entries.get("kind", ""))
         else:
-            entries, _ = CODECS[path.suffix][1](path.read_bytes())  # `read_file` registers an input
+            # Do not call `read_file`, because it would register the file as an input.
+            entries, _ = CODECS[path.suffix][1](path.read_bytes())
             names, kind = {*entries}, text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types
         return ""

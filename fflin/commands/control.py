@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
 
-_ROWS = 240  # rows of errors and inputs in a figure
+_ROWS = 240  # number of times at which errors and inputs are plotted
 _RUNS = ("dt", "knots", "samples", "seed", "confidence", "threads")
 
 _ALLOCATED = (
@@ -281,7 +281,7 @@ def sweep(arguments: Namespace) -> Report:
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
     said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
-    print(f"fflin: {said}", file=sys.stderr)  # all options are valid
+    print(f"fflin: {said}", file=sys.stderr)  # after all options have been checked
     with going_on(path, "points") as progress:
         work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
         batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
@@ -323,7 +323,10 @@ def _points(
 
 @contextmanager
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
-    """Return a context with a progress bar; after Ctrl-C, it reports how to resume the command."""
+    """Return a context with a progress bar.
+
+    After Ctrl-C, the raised `KeyboardInterrupt` states how to resume the command.
+    """
     from fflin.batch.files import part_of
 
     bar = Progress()

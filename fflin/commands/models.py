@@ -207,7 +207,7 @@ def model_report(lin: fflin.LinearModel) -> str:
     parts = [folded([head, *_units(lin)])]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
     # Report unstable poles only at an equilibrium, because poles do not determine the stability of
-    # a motion. If A^2 = 0, all poles are zero, so none is unstable.
+    # a motion. If A^2 = 0, do not compute the poles, because all of them are zero.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
@@ -239,10 +239,10 @@ def model_report(lin: fflin.LinearModel) -> str:
 
 
 def _units(lin: fflin.LinearModel) -> list[str]:
-    """Return one line each with the units of the states, inputs and outputs.
+    """Return lines of text with the units of the states, of the inputs and of the outputs.
 
-    For example, the line of the inputs is "u: tau_b [N m], F_b [N], tau_m [N m]". The outputs are
-    omitted if they are the states.
+    For example, the line for the inputs is "u: tau_b [N m], F_b [N], tau_m [N m]". There is no line
+    for the outputs if they are the states.
     """
     signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
     if lin.output_names != lin.state_names:

@@ -26,7 +26,7 @@ _LOOP = {
     ROBOT: _SYSTEM,
 }
 
-# {command: {title of the group: options}}, in the order of the help; a positional argument is in
+# {command: {title of the group: options}}, in the order of the help; positional arguments are in
 # capitals.
 OPTIONS: dict[str, dict[str, str]] = {
     "robots": {},

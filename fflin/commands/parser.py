@@ -1,4 +1,4 @@
-"""Parser of a command, the forms of its options, and functions that read option values."""
+"""Parser of a command, the `add_argument` keywords of all options, and readers of option values."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def input_name(text: str) -> str:
 class OutputFile:
     """Reader for the path of an output file, which must have one of the `endings`.
 
-    If `kinds` is not empty, -o without --force replaces an existing file only if the file contains
-    a result of one of these kinds.
+    `kinds` are class names of results. If there are any, the command replaces an existing file only
+    if the file contains such a result, or if --force is given.
     """
 
     endings: tuple[str, ...]
@@ -93,7 +93,7 @@ def joint_or_all(text: str) -> tuple[str | None, float | str]:
 
 
 def lock(text: str) -> tuple[str, float | None]:
-    """Read NAME=VALUE or NAME; the value of NAME alone is None, for the neutral position."""
+    """Read NAME=VALUE or NAME; return (name, value), or (name, None) for the neutral position."""
     return assignment(text) if "=" in text else (text, None)
 
 
@@ -145,17 +145,17 @@ def one(
     default: float | str | None = None,
     **more: object,
 ) -> Form:
-    """Return the form of an option that may be given only once."""
+    """Return the `Form` of an option that may be given only once."""
     return {"type": reader, "metavar": metavar, "default": default, **more}
 
 
 def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
-    """Return the form of an option that may be repeated."""
+    """Return the `Form` of an option that may be repeated."""
     return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
 
 
 def _saved(*kinds: str, endings: tuple[str, ...] = (".npz", ".mat", ".json")) -> Form:
-    """Return the form of -o for a command whose results are of these kinds."""
+    """Return the `Form` of the option -o; `kinds` are the class names of the command's results."""
     return one(OutputFile(endings, kinds), "FILE")
 
 
@@ -170,7 +170,7 @@ _FORMER: Form = {**_TIME, "dest": "former_dt"}
 _UNSATURATED: Form = {"choices": ("urdf", "none"), "default": "none"}
 _TABLE = (".npz", ".mat", ".json", ".csv")
 
-# {option or ARGUMENT: form of its value}. A key "COMMAND OPTION" applies to this command only.
+# {option or ARGUMENT: its `Form`}. A key "COMMAND OPTION" applies to this command only.
 # Options without an entry are switches.
 FORMS: dict[str, Form] = {
     "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
@@ -269,7 +269,7 @@ _REPEATABLE = " (repeatable)"
 
 
 class Command(argparse.ArgumentParser):
-    """Parser of a command that reports errors in one line."""
+    """Parser of a command; it reports errors in one line."""
 
     def _print_message(self, message: str, file: object = None) -> None:
         # Print the text here, because argparse would ignore an error while it writes the text.
@@ -348,7 +348,7 @@ class Help(argparse.Action):
 
 
 def short_help(command: argparse.ArgumentParser) -> str:
-    """Return the short help, with the first sentence about each common option of a command."""
+    """Return the short help of a command, with one sentence about each of its common options."""
     arguments = [each for each in command._actions if not each.option_strings]
     _, *every = (each for each in command._actions if each.option_strings)
     options = {each.dest.replace("_", "-"): each for each in every}

@@ -380,7 +380,10 @@ def _turned(x: Array) -> tuple[Array, Array]:
 
 
 def _in_reference(frame: str, nx: int) -> list[Indices]:
-    """Return the state indices (3,) of each base velocity that `frame` has in reference axes."""
+    """Return the state indices (3,) of each base velocity that is in reference axes.
+
+    The frame named `frame` determines the axes of omega_b and v_b.
+    """
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 

@@ -245,10 +245,11 @@ class Accelerations:
         """
         model, data, state, actuation = self._model, self._data, self._state, self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
-        # Here, the base is in its neutral pose and has no linear velocity, because c does not
-        # depend on its pose and linear velocity. Large values would make Pinocchio's derivatives
-        # less accurate. Gravity is zero as well, because uniform gravity accelerates all parts of
-        # the robot alike (equivalence principle).
+        # Here, the base is in its neutral pose and has no linear velocity, because large values
+        # would make Pinocchio's derivatives less accurate. Without an orbit, c does not depend on
+        # the pose and linear velocity of the base. In orbit, c depends on the attitude only through
+        # `tide`. Gravity is zero as well, because uniform gravity accelerates all parts of the
+        # robot alike (equivalence principle).
         q_still, v_still = self.inertia.centred(q), self._still
         v_still[3:] = v[3:]
         if tide:

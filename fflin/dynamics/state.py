@@ -335,7 +335,7 @@ class StateMap:
         return matrix.take(self._flat, out=out, mode="clip")
 
     def project_transposed(self, matrix: Array, out: Array) -> None:
-        """Write the last rows of ``(S.T @ matrix @ S).T`` into a C-contiguous array (.., 6 + n)."""
+        """Write the last k rows of ``(S.T @ matrix @ S).T`` to a C-contiguous array (k, 6 + n)."""
         if self.S is None:
             matrix.take(self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip")
         else:

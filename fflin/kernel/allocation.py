@@ -202,7 +202,7 @@ def _write_force(work, robot, point, columns, at):
 
 @called
 def solve(problem, size, lane):
-    """Write the solution for one lane to `problem.x`; it is NaN if the force is NaN."""
+    """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
     least, most, count = problem.least, problem.most, len(problem.least)
     write_scaled(problem.columns, lane, 1.0, A)
