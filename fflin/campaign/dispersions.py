@@ -295,8 +295,9 @@ class Dispersions:
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            before = changed.get(own, model.inertias[own].toPseudoInertia().toMatrix())
-            changed[own] = before + varied(pieces[at], *changes)
+            changed[own] = changed.get(own, 0.0) + varied(pieces[at], *changes)
+        for own, change in changed.items():
+            changed[own] = model.inertias[own].toPseudoInertia().toMatrix() + change
         return dict(zip(changed, map(properties, changed.values()), strict=True))
 
     def _springs(self, drawn: Array) -> dict[str, Array]:

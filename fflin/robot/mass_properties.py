@@ -228,20 +228,24 @@ def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
     pieces, link_of = robot.pieces, robot.link_of
     if key in pieces or key in link_of:
         return [key if key in pieces else link_of[key]]
-    names = [*filterfalse(robot.sums.__contains__, pieces), *link_of]
+    names = [*filterfalse(robot._sums.__contains__, pieces), *link_of]
     found = [names[i] for i in matching(kind, key, names)]
     return list(dict.fromkeys(map(link_of.get, found, found)))
 
 
-def sums_of(robot: Robot) -> set[str]:
+def sums_of(robot: Robot) -> frozenset[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
     linked = {each.joint for each in robot.pieces.values() if not each.whole}
-    return {name for name, each in robot.pieces.items() if each.whole and each.joint in linked}
+    pieces = robot.pieces.items()
+    return frozenset(name for name, each in pieces if each.whole and each.joint in linked)
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
     """Return the spatial inertia of a piece in the frame of its joint."""
-    return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
+    # The constructor of pin.Inertia refuses an inertia that is negative due to rounding errors.
+    body = pin.Inertia(piece.mass, np.zeros(3), np.zeros((3, 3)))
+    body.inertia = piece.inertia
+    return piece.placement.act(body)
 
 
 def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:

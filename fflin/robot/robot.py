@@ -350,7 +350,7 @@ class Robot(Coordinates):
         return replace(changed, model=model, joints=self.joints, followers=self.followers)
 
     pieces = cached_property(mass_properties.pieces_of)
-    sums = cached_property(mass_properties.sums_of)
+    _sums = cached_property(mass_properties.sums_of)
 
     @cached_property
     def link_of(self) -> dict[str, str]:

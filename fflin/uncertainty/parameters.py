@@ -56,7 +56,7 @@ class Parameters(dict[str, Parameter]):
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
-        self._sums = robot.sums
+        self._sums = robot._sums
         of_pieces = (each for item in self.pieces.items() for each in _of_piece(*item))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)

@@ -43,3 +43,14 @@ def test_check_holds(name):
         point = random_point(robot, rng, degrees=160.0)
         found = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
         assert found.ok, found
+
+
+def test_an_inertia_that_is_negative_by_rounding_is_that_of_a_link():
+    robot = fflin.load("icub", lock=["neck_roll", "neck_yaw"])
+    link = robot.links["r_hip_2"]
+    assert -1e-18 < np.linalg.eigvalsh(link.inertia)[0] < 0.0 < link.mass
+    assert sum(each.mass for each in robot.pieces.values() if not each.whole) == pytest.approx(
+        robot.mass
+    )
+    model = fflin.uncertain(robot, {"base.mass": 0.1})
+    assert model.names == ("base.mass",)
