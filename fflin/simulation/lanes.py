@@ -1,7 +1,7 @@
 """The compiled engine, which simulates eight runs in parallel.
 
-Each run has a lane, the last axis of the arrays. If there are fewer runs, the remaining lanes
-repeat the last run.
+The last axis of every array has eight entries, called lanes, one for each run. If there are fewer
+than eight runs, the remaining lanes repeat the last run.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,21 +30,23 @@ from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_co
 _OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
 OfOutputs: TypeAlias = LinearController | TrajectoryOutputFeedback
 _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
-# With more steps, a single run uses the compiled loop, if its machine code is already stored.
+# By default, a single run of more than LONG steps uses the compiled loop, if the machine code of
+# the loop is already stored.
 LONG = 20_000
 
-SLOTS = 128  # number of samples whose noise is stored, and of steps in a slice of a campaign
+SLOTS = 128  # samples whose noise is stored at a time
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
-# {name of an argument of the loop: its values (N, size) in N runs}; see `Dispersions.in_lanes`.
+# {name of an array of the loop: its values (N, size) in N runs}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
 def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
-    """Return the name of the requested engine, or choose an engine for a plan.
+    """Return the name of the engine for a plan: the requested engine, or the default engine.
 
-    By default, many runs use the compiled loop if it supports the plan. A single run uses it only
-    if the run is long and the machine code has been stored by an earlier run.
+    If the compiled loop supports the plan, it is the default engine for many runs. For a single
+    run, it is the default only if the run is long and the machine code of the loop has been stored
+    by an earlier run.
     """
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
@@ -81,12 +83,15 @@ def not_compilable(plan: Plan) -> str:
 
 
 def noise_generator(seed: float) -> np.random.Generator:
-    """Return the random generator for the noise of a run."""
+    """Return the random generator for the sensor noise of the run with this seed."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
-    """Return the indices (k,) of the samples between two steps, and their noise (k, size)."""
+    """Return the indices (k,) and the sensor noise (k, size) of the samples in a range of steps.
+
+    The range begins with `step` and ends before `last`.
+    """
     times = plan.times
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
     rows = np.zeros((len(at), size))
@@ -100,7 +105,7 @@ class Statistics:
     """Base class for statistics of eight parallel runs; this class collects none."""
 
     every = 1  # steps from one row to the next
-    span = 4096  # steps between checks of `over`, and for Ctrl-C
+    span = 4096  # steps between calls of `over`; Ctrl-C takes effect after at most so many steps
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return the mask (LANES,) of the runs that must end early, from their q and v."""
@@ -112,19 +117,21 @@ class Statistics:
     def add(self, first: int, rows: Array) -> None:
         """Add rows (count, width, LANES) of q, nu, u, momentum and centre of mass.
 
-        The first row is at step `first`. The same row may be added twice.
+        The rows are at the multiples of `every`, beginning with the first multiple that is at least
+        `first`. When a run ends, a single row at the step `first` is added for all lanes. The lanes
+        that continue may add this row again.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the outcomes after `done` steps; `stop` has an index in STOPS for each lane."""
+        """Return the outcomes after `done` steps; `stop` (LANES,) contains indices in STOPS."""
         return {}
 
 
 class LaneLoop:
-    """The compiled loop for a plan. Each thread needs its own, because it contains work space.
+    """The compiled loop for a plan. Each thread needs its own loop, which contains work space.
 
     `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
-    u, momentum and centre of mass. These five parts end at the columns `ends`.
+    u, momentum and centre of mass. `ends` (5,) contains the column after each of these vectors.
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
@@ -132,12 +139,13 @@ class LaneLoop:
         if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
         stop = stop_conditions(plan)
-        if runs:  # all runs are given with a quaternion for which the sign is positive
+        if runs:  # the sign of each quaternion in `runs` is such that `stop.sign` is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
         self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
-        # `_fresh` has pairs of an array with one column per lane and the column of initial values.
+        # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
+        # values that is copied to all lanes.
         self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
         self._work = work_space(self.parts.robot.tree.size)
         self._advance = kernel("loop", "advance")
@@ -150,9 +158,10 @@ class LaneLoop:
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
-        """Simulate up to eight runs, by default the plan's own run; return why each was stopped.
+        """Simulate up to eight runs; return for each the reason why it stopped, or an empty text.
 
-        Row i of each array in `out` receives the outcome of run i.
+        `runs` contains the values that differ between the runs. Without `runs`, the plan itself is
+        simulated. Row i of each array in `out` receives the outcome of run i.
         """
         times, every, point = self._plan.times, statistics.every, self.parts.point
         steps, count = times.steps, len(next(iter(out.values()))) if out else 1
@@ -190,8 +199,8 @@ class LaneLoop:
                     continue
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
-                # The stop condition of a single lane stops the loop for all lanes. The lane of a
-                # finished run therefore continues as a copy of a running lane.
+                # A stop condition in one lane stops the loop for all lanes. A finished lane would
+                # stop it again at every step, so it continues as a copy of a running lane.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:
@@ -201,7 +210,11 @@ class LaneLoop:
         return messages
 
     def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
-        """Write the initial values of all runs; return a function that writes sensor noise."""
+        """Write the initial values of all runs; return a function that writes sensor noise.
+
+        The function must be called before each slice, with the first step of the slice and the step
+        after its last.
+        """
         for array, initial in self._fresh:
             array[:] = initial
         for name, values in runs.items():
@@ -221,7 +234,8 @@ class LaneLoop:
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            if not self._noisy or drawn == last:  # the end of a run interrupted the slice
+            # If the end of a run interrupted the slice, its noise has been drawn already.
+            if not self._noisy or drawn == last:
                 return
             drawn = last
             k, values = noises(self._plan, size, step, last)
@@ -248,7 +262,7 @@ class LaneLoop:
 
 
 class LaneRows(Statistics):
-    """Recorded rows of a single run: one row every `every` steps, with the columns of the loop."""
+    """Recorded rows of a single run, one every `every` steps, with the columns of `LaneLoop`."""
 
     def __init__(self, times: Times, width: int) -> None:
         self.every, self.kept = times.every, np.empty((times.rows, width))
@@ -260,7 +274,7 @@ class LaneRows(Statistics):
 
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
-    """Simulate a plan with the compiled loop; `runs` are the values of one dispersed run."""
+    """Simulate a plan with the compiled loop; `runs` contains the values of one dispersed run."""
     every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, runs)
     rows = LaneRows(plan.times, loop.width)
     try:
@@ -282,14 +296,14 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
-    The squared rates in `stop` are in the order of v. If `noisy`, the law gets memory for noise.
+    The squared rates in `stop` are in the order of v. If `noisy`, the law stores the noise of SLOTS
+    samples, even if the policy defines no noise.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     mechanics = mechanics_of(plant)
-    # Limit the delay to the length of the run, because later commands need no space in the delay
-    # line.
+    # The delay line needs no space for commands that arrive after the end of the run.
     channel = channel_of(plan.limits, u, times.sample, min(times.delay, times.steps))
     return loop.Arguments(
         robot=mechanics,
@@ -309,7 +323,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
         ),
         law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
-        # The loop sets these values when it starts.
+        # The loop writes the values of this reference when it starts.
         reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
@@ -321,7 +335,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
 
 
 def mechanics_of(plant: Plant) -> forward.Mechanics:
-    """Return the kernel's parameters of a robot."""
+    """Return the parameters of a robot and its actuators for the kernel."""
     robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
     springs = robot.springs
     assert tree is not None
@@ -341,7 +355,7 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return the law of an uncontrolled robot, which computes states and errors but no commands."""
+    """Return the law of an uncontrolled robot; the law computes states and errors, no commands."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -358,7 +372,8 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
 def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy.
 
-    With an allocation, it commands the robot of the design.
+    If the policy is an `Allocation`, the law commands the inputs of the robot `design`, and
+    allocates these commands to the inputs of the simulated robot.
     """
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
@@ -396,7 +411,10 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
 
 
 def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -> policies.Law:
-    """Return the law of a compensator; along a trajectory, it has matrices for each sample."""
+    """Return the law of a compensator `policy`, which commands the inputs of `asking`.
+
+    Along a trajectory, the law contains the matrices of the compensator for each sample.
+    """
     state, times, rows = asking.state, plan.times, 1
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
@@ -425,7 +443,11 @@ def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -
 
 
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
-    """Return the allocation from the commands of `asking` to the inputs of `giving`."""
+    """Return the allocation of commands to the inputs of the simulated robot.
+
+    The commands are the inputs of the robot in `asking`. The simulated robot has the parameters
+    `giving`, and is the robot of `plant`.
+    """
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
     inputs = max(len(robot.actuation.names) for robot in (asking, plant))
@@ -442,7 +464,10 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
 def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
-    """Return a trajectory and its gains; for a longer run, append the gain for its end point."""
+    """Return the trajectory and the gains of a policy.
+
+    If the run is longer than the trajectory, the end point and its gain are appended.
+    """
     motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
     q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]

@@ -28,7 +28,8 @@ from fflin.simulation.report import Passed, Saturated, curves, motion_report, pa
 
 FORMATS = (*record.FORMATS, ".csv")
 
-# Largest accepted jump of positions and rates from the end of a phase to the start of the next.
+# Largest accepted jump of a position or rate [SI units] from the end of a phase to the start of the
+# next. It is multiplied by the largest rate at the end of the phase, if this exceeds 1.
 _MET = 1e-6
 
 
@@ -344,7 +345,10 @@ def require_motion(motion: object) -> Motion:
 
 
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
-    """Convert rows of `other` to the coordinates of `robot`; missing joints stay at `last`."""
+    """Convert rows q (N, nq) and v (N, nv) of the robot `other` to the coordinates of `robot`.
+
+    Joints that `other` lacks are at rest, at their positions in the configuration `last` (nq,).
+    """
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
@@ -355,7 +359,10 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
 
 
 def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
-    """Append the rows of `motion`, converted to the chart, joints and inputs of `whole`."""
+    """Append the rows of `motion` to `whole`, converted to the chart, joints and inputs of `whole`.
+
+    The appended phase gets the name `name`.
+    """
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
         where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
         raise InputError(

@@ -34,17 +34,17 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
-# Bounds of an automatic duration [s], and the time step [s] of the linear simulation that
-# determines it.
+# SHORTEST and LONGEST are the bounds [s] of an automatic duration. The duration is determined by a
+# linear simulation with the time step _LOOK [s].
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
-_STEP = 0.01  # [s]
-# If inputs jump at knots, the last stage of a step is evaluated earlier, by this fraction of the
-# step.
+_STEP = 0.01  # [s] default time step
+# If the inputs of a trajectory jump at its knots, the last stage of a step is evaluated earlier by
+# this fraction of the step, so that an input jump at the end of the step is not yet included.
 _BEFORE = 1e-6
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-# More steps than _MANY_STEPS (half a minute of computing) cause a warning if a fast pole determines
-# the automatic time step. More steps than _ENDLESS (some hours) are refused if `every` is not
-# given.
+# If a fast pole determines the automatic time step, a run of more than _MANY_STEPS steps (half a
+# minute of computing) causes a warning. If `every` is not given, a run of more than _ENDLESS steps
+# (some hours) is refused.
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
 # If `every` is not given, all steps of a run with at most _MANY_ROWS steps are recorded. If a run
 # has more steps, only about _FEW_ROWS of them are recorded.
@@ -81,7 +81,7 @@ class SimulationOptions:
 
 
 class Times(NamedTuple):
-    """Time step `dt` [s] of a simulation, and its other times as numbers of steps."""
+    """Time step `dt` [s] of a simulation; its other times are numbers of steps."""
 
     dt: float
     steps: int
@@ -97,7 +97,7 @@ class Times(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """Square of the largest angular velocity at which a step is accurate."""
+        """Squared angular velocity [rad^2/s^2] up to which a step is accurate."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
 
@@ -131,37 +131,38 @@ class Plan:
             if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
-        # Limits {state or input: (least, largest)} at which inputs saturate.
+        # {state or input: (least, largest)}: the limits that saturation enforces.
         self.acting = chosen_limits(robot, options.limits)
         self.limits = saturation(
             robot, self.acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
-        # `initial` contains the inputs (nu,) until the first command arrives. Without a law, they
-        # act throughout the run.
+        # `initial` contains the inputs (nu,) that act until the first command arrives. If there is
+        # no law, they act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
-        # `target` is the target state (nx,) or None. `reference` is the followed motion, as a
-        # function of time, or None.
+        # `target` is the target state (nx,) or None. `reference` is a function of time that returns
+        # q, v and u of the motion that the policy follows, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
-        # State (nx,) that determines the number of full turns of continuous joints in the first
-        # row.
+        # In the first row of the motion, the angle of each continuous joint is within half a turn
+        # of its angle in the state `near` (nx,), or of 0 if `near` is None.
         self.near = self.target
         if options.x0 is not None:
             self.near = np.asarray(options.x0, dtype=float)
         elif self.reference:
             self.near = state.read(*self.reference(0.0)[:2])
-        # Momentum and centre of mass are not projected in orbit, where they are not conserved.
+        # Whether each step is corrected so that momentum and centre of mass match their prediction.
+        # In orbit, they are not conserved, and not corrected.
         self.project = truth("project", options.project) and robot.orbit is None
-        # Indices in v of the angular rates whose rotation per step is bounded: base and revolute
-        # joints, but not rotors, because nothing depends on the angle of a rotor.
+        # Indices in v of the angular rates of the base and the revolute joints, whose rotation per
+        # step is limited. Rotors are excluded, because nothing depends on the angle of a rotor.
         rotors, joints = robot.rotors, robot.joints
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         self.steered = fed_back(policy)  # states that are known to be fed back
-        # Function noise(t) of the policy, which returns measurement noise, or None.
+        # Function of time that returns the measurement noise, if the policy defines it, or None.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
@@ -174,13 +175,17 @@ class Plan:
         return other
 
     def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
-        """Return the inputs under a law as a function of the step and the arguments of the law."""
+        """Return a function f(step, *point) that computes the inputs (nu,) of a step.
+
+        f calls `law` with `point` for the command, and `speeds` with `point` for the speeds of the
+        limited wheels. It then applies limits, sample and hold, and the delay.
+        """
         times = self.times
         return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot; return a law that checks the policy's commands."""
+    """Bind the policy to the robot; return a law that checks its commands, or None if no policy."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -188,7 +193,10 @@ def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> La
 
 
 def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
-    """Return the target state (nx,), given as a state, as a model about it, or as None."""
+    """Return the target state (nx,), or None if there is no target.
+
+    The argument `target` is the state itself, or a linear model about this state.
+    """
     if target is None:
         return None
     if not isinstance(target, LinearModel):
@@ -196,7 +204,8 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
     theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
-    # In orbit, the model must have the same frame, because the orbital frames have different q.
+    # In orbit, the model and the simulation must have the same frame, because q is relative to the
+    # orbital frame.
     if target.moving or not theirs or (state.robot.orbit and target.frame != state.frame):
         raise InputError(
             f"target is a model of '{target.robot}' in frame '{target.frame}', expected a state of "
@@ -208,7 +217,11 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 
 
 def _state_of(policy: object, options: SimulationOptions) -> StateMap:
-    """Return the state map of a motion; frame and reference are the policy's, if it has any."""
+    """Return the state map of a motion.
+
+    If the policy has a frame and a reference, the state map uses them. Otherwise, it uses the frame
+    and the reference of `options`.
+    """
     robot, frame, reference = options.robot, options.frame, options.reference
     own_frame, own_reference = axes_of(policy)
     other_frame = own_frame is not None and frame not in (None, own_frame)
@@ -230,7 +243,10 @@ def _state_of(policy: object, options: SimulationOptions) -> StateMap:
 
 
 def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
-    """Return the inputs (nu,) before the first command; warn if they exceed the limits."""
+    """Return the inputs (nu,) before the first command.
+
+    Warn if these inputs, or the inputs of a followed trajectory at any time, exceed the limits.
+    """
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
     # With an allocation, the policy's model has other inputs than the robot.
     if lin is not None and lin.input_names == actuation.names:
@@ -279,7 +295,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         )
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
-    # If the policy is sampled, record rows only at samples.
+    # If not every step is recorded, record a sampled policy only at its samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
     if thinned:
@@ -307,7 +323,10 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 
 
 def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
-    """Return a policy's sample time [s], or else None and the fastest pole of its loop [1/s]."""
+    """Return the sample time [s] and 0, or for a continuous policy None and a rate [1/s].
+
+    The rate is the absolute value of the fastest pole of the closed loop, or 0 if it is not known.
+    """
     follows, by = tracking_of(policy), decider(policy)
     if sample is not None:
         return _positive("sample", sample), 0.0
@@ -332,7 +351,10 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 
 
 def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a time step that divides the sample time and, if possible, all other times."""
+    """Return a time step of at most `largest` [s] that divides the sample time.
+
+    If possible, the step divides all other `times` too.
+    """
     least = int(np.ceil(sample / largest))
     steps = [sample / parts for parts in range(least, least + 1000)]
     fit = (dt for dt in steps if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times))
@@ -347,10 +369,11 @@ def _positive(name: str, value: object) -> float:
 
 
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
-    """Return the time [s] after which the linear loop's errors stay below 1 % of their maxima.
+    """Return the time [s] after which the errors of the linear closed loop have settled.
 
-    The time is rounded up to tens of seconds and is at least SHORTEST. If the loop does not settle
-    before LONGEST, return SHORTEST.
+    The errors of attitude, position and joints have each settled once they stay below 1 % of their
+    largest value. The time is rounded up to a multiple of 10 s, and is at least SHORTEST. If the
+    loop does not settle before LONGEST, return SHORTEST.
     """
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)

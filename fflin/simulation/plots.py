@@ -39,14 +39,14 @@ _TITLES = {
 }
 JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
-# A target counts as at rest if it moves less than this [SI] between two rows.
+# A target is at rest if each of its positions changes by less than this [SI units] from row to row.
 _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
     """Return the time [s] from which a moving target rests.
 
-    Return None if the target never moves, does not come to rest, or if the motion has phases.
+    Return None if the target never moves or never comes to rest, or if the motion has phases.
     """
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
@@ -118,7 +118,7 @@ def plot_motion(
             if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
             if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
-                # One legend below names the joints of all charts, because their names are long.
+                # Joint names are long, so one legend below the charts is valid for all of them.
                 named = legends.setdefault("joints" if group in JOINTS else title, {})
                 named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
             else:
@@ -149,7 +149,7 @@ def plot_motion(
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
-    """Return {title of a chart: its curves} for the chosen signals; a chart has only one unit."""
+    """Return {chart title: curves} for the signals in `show`; a chart has only one unit."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
@@ -164,7 +164,11 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
-    """Return the errors from the reference, or else the differences from the linear prediction."""
+    """Return what the panels below the states show, and {state: curve} for these panels.
+
+    If the motion follows a reference, the curves are the errors from the reference. Otherwise, they
+    are the differences from the linear prediction. Without a prediction, there are no curves.
+    """
     names, units, what = motion.state_names, motion.state_units, "error"
     if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
@@ -185,7 +189,7 @@ def _draw(
     colors: Mapping[str, str],
     width: float | None = None,
 ) -> None:
-    """Draw curves and their limits; references are pale, and predictions dashed."""
+    """Draw curves and their limits, with references in pale colours and predictions dashed."""
     group, unit = found[0].group, found[0].unit
     # Attitude curves have gaps at 180 degrees, where the quaternion changes its sign.
     for field in ("values", "linear", "reference") if group == "q_b" else ():
@@ -221,8 +225,8 @@ def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> 
 
 
 def _draw_drifts(axes: Axes, motion: Motion) -> None:
-    # A logarithmic axis has no zero, so smaller drifts are raised to a tenth of the machine
-    # epsilon.
+    # A logarithmic axis cannot show zero, so drifts below a tenth of the machine epsilon are drawn
+    # at this value.
     drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):

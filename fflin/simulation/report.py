@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 # An error has settled once it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# An error [SI units] that never exceeds THERE means that the robot is at its target throughout. A
-# value below _NOTHING is shown as zero. Rounding errors of a robot at rest are smaller than both
-# values.
+# If an error [SI units] never exceeds THERE, it counts as zero throughout the run. A value below
+# _NOTHING is shown as a dot. The rounding errors of a robot at rest are smaller than both values.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# A settled error must stay small at least over this last fraction of the rows of a run.
+# An error counts as settled only if it stays small during this last fraction of the rows of a run,
+# or longer.
 DWELL = 0.05
 
-# Smallest violation that is reported, relative to the limit. Smaller ones may be integration
-# errors.
+# Smallest limit violation that is reported, relative to the limit. Smaller violations may be
+# integration errors.
 _SHARE = 1e-3
 
 _MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
@@ -43,7 +43,8 @@ _OF_PHASES = (
 STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 _TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
-# {group: titles} of the errors of flexible appendages and liquids, which the verdict ignores.
+# {group: titles} of the errors of flexible appendages and liquids. These errors do not decide
+# whether a motion has settled.
 _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
 _ALL_OF_MODES = {title for titles in _OF_MODES.values() for title in titles}
 _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
@@ -51,12 +52,15 @@ _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 # Rotation [deg] above which modal amplitudes are inaccurate, because the modal model is linear.
 _LINEAR = 5.0
 
-# A limit is drawn if the curve reaches at least this fraction of it.
+# A limit is drawn only if the curve reaches this fraction of the limit.
 _NEAR = 1.0 / 3.0
 
 
 class Curve(NamedTuple):
-    """Values (N,) of a state or input, with its limits, and its prediction and reference if any."""
+    """Values (N,) of a state, input or wheel momentum, with its limits.
+
+    `linear` (N,) is the linear prediction and `reference` (N,) the followed reference, if any.
+    """
 
     key: str  # GROUP.NAME
     group: str  # "speed" and "momentum" of wheels
@@ -79,12 +83,12 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits that the values come near, which means that they reach _NEAR times the limit."""
+        """Limits of which the values reach at least the fraction _NEAR."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 
 def curves(motion: Motion) -> Iterator[Curve]:
-    """Yield a curve for each state, each input, and the speed and the momentum of each wheel."""
+    """Yield the curves of all states except wheel angles, of wheel momenta, and of all inputs."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
     unlimited = np.full(2, np.inf)
@@ -113,7 +117,7 @@ class Passed(NamedTuple):
     time: float
     limit: float
     unit: str
-    at_first: bool  # whether the violation is there from the start
+    at_first: bool  # True if a joint is beyond its position limit from the start
 
     def __str__(self) -> str:
         value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
@@ -181,7 +185,7 @@ def _shown(value: float) -> str:
 
 
 def settled_at(sizes: Array) -> Indices:
-    """Return the row at which each error (N, ..) has settled, or N if it has not settled."""
+    """Return the row from which each error in `sizes` (N, ...) is settled, or N if it is never."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
@@ -190,13 +194,13 @@ def settled_at(sizes: Array) -> Indices:
 def is_late(settled: Array | Indices | int, count: int) -> Mask | bool:
     """Return whether errors settle too close to the end of a run of `count` rows.
 
-    Such errors count as not settled, because they may only pass through zero at the end.
+    Such errors count as not settled, because they may just be passing through zero.
     """
     return settled > (1.0 - DWELL) * count
 
 
 class ErrorSize(NamedTuple):
-    """Initial, largest and final size of one kind of error in a motion."""
+    """Initial, largest and final size of one kind of error in a motion, such as attitude errors."""
 
     title: str
     unit: str
@@ -227,8 +231,9 @@ def _cells(*values: float) -> list[str]:
 def error_sizes(motion: Motion) -> list[ErrorSize]:
     """Return the sizes of each kind of error, or an empty list if the motion has no target.
 
-    Wheel speeds and modes are separate kinds. Wheel angles are excluded, because nothing depends on
-    them.
+    The size of attitude errors is the angle [deg]. For every other kind, it is the largest absolute
+    error of a state of this kind. Wheel speeds and modes are not counted as joints, but as separate
+    kinds. Wheel angles are excluded, because nothing depends on them.
     """
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -255,7 +260,7 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
 
 
 def pushed(of: object) -> bool:
-    """Return whether a motion or similar object has inputs that exert a force on the base."""
+    """Return whether a motion or actuation has inputs that exert a force on the base."""
     return not {"F_b", "thrust"}.isdisjoint(map(group_of, input_keys(of)))
 
 
@@ -309,7 +314,8 @@ def motion_record(motion: Motion) -> dict[str, object]:
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     errors = error_sizes(motion)
-    # Revolute and prismatic joints have errors of the same title in two units.
+    # The errors of revolute and of prismatic joints have the same title but different units. If
+    # both exist, the unit is added to the name.
     count = Counter(each.title for each in errors)
     keys = [f"{x.title} [{x.unit}]" if count[x.title] > 1 else x.title for x in errors]
     return {
@@ -333,8 +339,9 @@ def _phases(motion: Motion) -> list[list[str]]:
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        # Each line has a label, a row of the motion, and the energy and momentum that are added to
-        # those of the row. Before an impact, these are the amounts that the impact removes.
+        # A line of the table is (label, index of a row of the motion, energy and momentum that are
+        # added to those of the row). The rows contain only the values after an impact. In the line
+        # for the time before it, the energy and momentum that the impact removed are added.
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)
@@ -349,7 +356,10 @@ def _phases(motion: Motion) -> list[list[str]]:
 
 
 def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
-    """Return one line that says whether the motion settled, or which errors did not."""
+    """Return one line that says when the motion settled, or which errors did not settle.
+
+    The line also names the saturated inputs.
+    """
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
@@ -386,7 +396,7 @@ def _and(words: list[str]) -> str:
 
 
 def _largest_modes(motion: Motion) -> str:
-    """Return a table with the largest amplitude of each mode, and the corresponding rotation."""
+    """Return a table with the largest amplitude of each mode and the rotation that it causes."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):

@@ -1,7 +1,8 @@
 """The Python engine: accelerations, conserved quantities, and the simulation loop.
 
-Without external forces, the momentum about a fixed point is constant, and the centre of mass moves
-along r_c(t) = r_c(0) + p t / m. In orbit, the Jacobi integral (14.3) is constant instead.
+Without external forces, the momentum about a fixed point is constant, and the centre of mass is at
+r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m. In orbit, the momentum is not
+constant. The Jacobi integral (14.3) is constant if inputs, disturbance and dampers do no work.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
 
 # Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force on the
-# base, torque on the base, joint forces. Force and torque are in base axes.
+# base and torque on the base, both in base axes, then the forces or torques of the joints.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Above this velocity, the motion has diverged, and a disturbance that is not finite is no error.
+# Above this velocity [SI units], the motion has diverged. A disturbance that is not finite then
+# raises no error.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -49,7 +51,10 @@ _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
 
 class Plant(Aba):
-    """The nonlinear robot with inputs, in the axes of the state's frame, and a disturbance."""
+    """The nonlinear robot with inputs, actuator faults and a disturbance.
+
+    The base torque and the base force in u are in the axes that the frame of `state` defines.
+    """
 
     def __init__(
         self,
@@ -62,7 +67,8 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         nu, groups = len(self.actuation.names), self.actuation.groups
-        # Indices of the first components of the base torque and the base force, if they are inputs.
+        # Indices in u of the first component of the base torque and of the base force, if these are
+        # inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
@@ -72,15 +78,16 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         self._columns = state.lift(self.actuation.fixed)
-        # Whether the inputs are the only forces, and their matrix is constant.
+        # True if, without a disturbance, the inputs are the only forces, and B_u is constant.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,) and, in base axes, the external wrench (6,) without gravity.
+        """Return dv/dt (nv,), and the wrench (6,) of inputs and disturbance on the whole robot.
 
-        In orbit, return [power, 0, 0, 0, 0, 0] instead of the wrench. The power [W] is the sum over
-        inputs, disturbance and dampers.
+        The wrench consists of force and torque in base axes. It does not include gravity. In orbit,
+        the wrench is replaced by [power, 0, 0, 0, 0, 0], with the total power [W] of inputs,
+        disturbance and dampers.
         """
         if self._faulty:
             given = np.empty(len(u))
@@ -110,7 +117,11 @@ class Plant(Aba):
         return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
-        """Return whether no external force acts; `driven` includes the wrenches of inputs."""
+        """Return True if no external force acts on the robot.
+
+        If `driven` is true, the inputs may be nonzero, and inputs that act on the base count as
+        external forces. Gravity and a disturbance are always external. In orbit, return False.
+        """
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
@@ -120,17 +131,17 @@ class Plant(Aba):
 class Conserved:
     """Prediction of the momentum and the centre of mass from the external impulse.
 
-    The momentum (6,) is the linear momentum, then the angular momentum about a fixed point, in
-    world axes. Momentum and centre of mass are advanced step by step from the initial state (11.2).
-    In orbit, the first entry of the momentum is the Jacobi integral, and the work of the forces
-    replaces the impulse.
+    `momentum` (6,) consists of the linear momentum and the angular momentum about a fixed point,
+    both in world axes. Momentum and centre of mass are advanced step by step from the initial state
+    (11.2). In orbit, the first entry of `momentum` is the Jacobi integral, and the work of the
+    forces replaces the impulse.
     """
 
     momentum: Array  # (6,) after the steps so far
-    wrenches: tuple[Array, ...]  # (6,) about the point for each stage; the caller writes them
+    wrenches: tuple[Array, ...]  # (6,) about the fixed point at each stage; written by the caller
 
-    # The fixed point is the initial position of the base. The world's origin would cause large
-    # rounding errors if the robot were far away from it.
+    # The fixed point is the initial position of the base. About the origin of the world, momenta
+    # would have large rounding errors if the robot is far away from the origin.
 
     def __init__(self, plan: Plan) -> None:
         robot, start = plan.plant.robot, plan.q[:3]
@@ -147,11 +158,14 @@ class Conserved:
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
-        # Columns: position and velocity of the centre of mass if no external forces act.
+        # The centre of mass at time t is the first column plus t times the second. The first column
+        # is its initial position plus the displacement by the external impulse so far. The second
+        # column is its initial velocity.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # Rows: the impulse, the displacement that it causes, and the wrenches at the stages of a
-        # step. If no external forces act, all rows are exactly zero.
+        # Rows: the impulse so far (6,), the displacement of the centre of mass that it causes (the
+        # first three entries), and the wrench (6,) at each stage of a step. If no external forces
+        # act, all rows are exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
@@ -159,7 +173,10 @@ class Conserved:
         self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the sum (6,) of a wrench in base axes and the weight, converted to world axes."""
+        """Return the wrench (6,) about the fixed point in world axes, including the weight.
+
+        `push` (6,) is the wrench in base axes without the weight. In orbit, `push` is returned.
+        """
         if self._field:
             return push
         base = _placement(q[:7] - self._start)
@@ -173,7 +190,7 @@ class Conserved:
         return total
 
     def advance(self) -> None:
-        """Advance by one step with the `wrenches` at its stages."""
+        """Advance momentum and centre of mass by one step, whose stages have the `wrenches`."""
         self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
         self._line[:, 0] = self._center + displacement[:3]
@@ -184,10 +201,11 @@ class Conserved:
         return self._line.dot(self._time)
 
     def impose(self, t: float, q: Array, v: Array) -> None:
-        """Correct the base position in `q` and base velocity in `v` to the predicted values."""
-        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Only the correction of nu_b
-        # is computed, from the error of the momentum, so its rounding errors are small. M is in
-        # base axes, so it does not depend on the base's position.
+        """Correct the base in `q` and `v` so that centre of mass and momentum are as predicted."""
+        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m), where c_b is the centre of
+        # mass and H_b the momentum, both relative to the base and in base axes. The equation for
+        # nu_b is solved for the correction of nu_b, which is small, and so are its rounding errors.
+        # M is in base axes, and therefore does not depend on the position of the base.
         momentum = self.momentum
         _crba(self._model, self._data, q)
         if self._stored:
@@ -198,7 +216,7 @@ class Conserved:
         if not self._free:
             base = self._root * base
         base.translation = self.center(t)
-        # The off-diagonal block of M_bb is -m [c]x.
+        # The upper right 3 x 3 block of M_bb is -m [c_b]x.
         position = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
         base.translation = position
         x, y, z = (position if self._free else self._root.actInv(position)).tolist()
@@ -210,10 +228,10 @@ class Conserved:
     def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
 
-        In this order: energy (N,), momentum about the centre of mass (N, 6), centre of mass (N, 3),
-        momentum about the fixed point (N, 6), and bounds (2,) of the linear and of the angular
-        momentum (11.5). In orbit, the Jacobi integral, followed by zeros, replaces the momentum
-        about the fixed point.
+        They are, in this order: energy (N,), momentum about the centre of mass (N, 6), centre of
+        mass (N, 3), momentum about the fixed point (N, 6), and the upper bounds (2,) of linear and
+        angular momentum (11.5). In orbit, the energy is the Jacobi integral. This integral and five
+        zeros replace the momentum about the fixed point, and its largest terms replace the bounds.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
@@ -223,8 +241,8 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             pin.ccrba(model, data, q_i, v_i)
-            # CCRBA sums the momentum about the origin, with larger rounding errors than this
-            # function.
+            # `ccrba` also computes this momentum, but sums it about the origin, which causes larger
+            # rounding errors.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
@@ -252,7 +270,7 @@ class Conserved:
         return energy, momentum, center, kept, scale
 
     def _of_wheels(self) -> Array:
-        """Return the stored momentum (3,) in world axes, for the link poses in `_data`."""
+        """Return the stored momentum (3,) of wheels in world axes, at the link poses in `_data`."""
         total: Array = np.zeros(3)
         for joint, stored in self._stored:
             total += self._data.oMi[joint].rotation @ stored
@@ -297,7 +315,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
         nonlocal stages
-        # At the first stage, `u` is already the policy's command; at later stages, ask the policy.
+        # At the first stage of a step, `u` already contains the inputs. At later stages, the inputs
+        # of a continuous policy are computed again.
         a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
         if pushed:
             kept.wrenches[stages][:] = wrench(q, push)
@@ -336,7 +355,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
-    """Return the stop conditions of a run; limits (nv,) of squared rates are in v's order."""
+    """Return the stop conditions of a run; `squares` (nv,) is in the order of v."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = plan.times.slow
     # If the policy has a linear model, the run ends when the base leaves the attitude chart.
@@ -346,7 +365,10 @@ def stop_conditions(plan: Plan) -> StopConditions:
 
 
 def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array], str]:
-    """Return a function that returns why the run ends, or an empty text if it continues."""
+    """Return a function of (t, q, v) that checks whether the run ends.
+
+    The function returns the reason, or an empty text if the run continues.
+    """
     # Use lists, because reading an entry of a list is faster than reading an entry of an array.
     stop = stop._replace(squares=stop.squares.tolist())
     anywhere = stop._replace(sign=[0.0])
@@ -379,7 +401,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
 
 
 def stop_of(message: str) -> int:
-    """Return the index in STOPS of the message with which a run ended."""
+    """Return the index in STOPS for the message with which a run ended."""
     for index, start in enumerate(STOPS):
         if start and message.startswith(start):
             return index

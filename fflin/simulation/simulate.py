@@ -28,14 +28,14 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
 
-# Linear model that predicts a motion, and the function from a deviation to the command (nu,). The
-# deviation from the operating point consists of the robot's states, followed by the states of a
-# continuous-time controller.
+# Linear model that predicts a motion, and a function that returns the command (nu,) for a deviation
+# from the operating point. The deviation consists of the states of the robot. If the controller is
+# in continuous time, its states follow.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
-# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. A run
-# then takes about the fraction _FRACTION of the time. Compiling takes about _COMPILING seconds, but
-# only once.
+# After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
+# compiled loop takes about the fraction _FRACTION of the time in Python. It must be compiled once,
+# which takes about _COMPILING seconds.
 _FRACTION, _COMPILING = 0.1, 30.0
 
 _log = logging.getLogger("fflin")
@@ -220,7 +220,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
-    """Build the motion from the recorded rows of a run; `foresees` adds a linear prediction."""
+    """Build the motion from the recorded rows of a run, with a linear prediction by `foresees`."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -247,8 +247,8 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         energy=energy,
         momentum=np.roll(momentum, 3, axis=1),
         momentum_drift=drift.max(axis=1),
-        # In orbit there is no com_drift, because the centre of mass moves on a curve even without
-        # other forces.
+        # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
+        # inputs and disturbances.
         com_drift=np.linalg.norm(center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
@@ -272,7 +272,10 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
 
 
 def predictor(plan: Plan) -> Predictor | None:
-    """Return the predictor of a plan's motion, by the given model or else the policy's own."""
+    """Return the predictor of a plan's motion, or None if there is no prediction.
+
+    The predictor uses the model in the option `linear`, or by default the model of the policy.
+    """
     linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
     own, _ = feedback_of(policy)
     lin = own
@@ -324,7 +327,10 @@ def predictor(plan: Plan) -> Predictor | None:
 # A prediction that overflows is omitted, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
-    """Return the states (N, nx) that the linear closed loop predicts; no rows if it cannot."""
+    """Return the states (N, nx) that the linear closed loop predicts.
+
+    Return no rows if the model cannot predict a motion, or if the prediction is not finite.
+    """
     lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
     if lin is None:  # a model in discrete time without its motion between samples
         return x[:0]
