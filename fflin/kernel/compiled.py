@@ -22,9 +22,8 @@ from fflin.base.process import Progress
 if TYPE_CHECKING:
     from fflin.kernel.machine_code import Compiled
 
-# Linux files that contain a container's quota of computing time [us], and then the period [us] to
-# which the quota applies. The first tuple is for control groups version 2, the second for version
-# 1.
+# Linux files with a container's quota of computing time [us], followed by the period [us] to which
+# the quota applies. The first tuple is for version 2 of control groups, the second for version 1.
 _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
@@ -42,8 +41,8 @@ _COMPILED = {
 # Version of Python, written as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
-# Times [s] to wait while another process compiles. After the first, a message is logged. After the
-# second, the wait ends.
+# Times [s] to wait while another process compiles. After _SILENCE, a message is logged. The second
+# wait is at most _LONGEST_WAIT.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
 _INTERVAL = 1.0  # [s] between updates of the time that a terminal shows during a compilation
 
@@ -54,7 +53,7 @@ _TURN, _COMPILING = Lock(), RLock()
 def available_cores() -> int:
     """Return the number of cores that this process may use.
 
-    It is limited by the CPU affinity of the process and by the quota of its container.
+    The CPU affinity of the process and the quota of the process's container limit the number.
     """
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
@@ -75,10 +74,11 @@ def numba_is_there() -> bool:
 
 
 def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
-    """Return True if compiled code is used: `engine` is not "python", and there is no obstacle.
+    """Return whether compiled code is used for the engine that the user chose.
 
-    `obstacle` returns the reason why compiled code cannot be used, or an empty text. Raise an error
-    for an unknown engine, and for the engine "compiled" if there is an obstacle.
+    The function `obstacle` returns the reason why compiled code cannot be used, or an empty text.
+    Compiled code is used if `engine` is not "python" and there is no such reason. Raise an error
+    for an unknown engine, and for the engine "compiled" if there is a reason.
     """
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
@@ -93,8 +93,8 @@ def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
 def kernel(module: str, name: str) -> Compiled:
     """Return a compiled function of the kernel.
 
-    The first call of the returned function compiles it and stores the machine code on disk. If the
-    disk already has the machine code, the first call loads it.
+    At its first call, the returned function is compiled, and the machine code is stored on disk. If
+    the machine code is already on disk, the first call only loads the machine code.
     """
     with _TURN:  # several threads may call this function at the same time
         return _prepared(module, name)
@@ -113,7 +113,7 @@ def _prepared(module: str, name: str) -> Compiled:
 
     def compile_alone(signature: object) -> object:
         """Compile the function for a signature, or load code that another process has stored."""
-        # A thread of this process must not wait for a file lock that another of its threads holds.
+        # A thread must not wait for a file lock that is held by another thread of the same process.
         # So `_COMPILING` admits only one thread at a time.
         with _COMPILING, _between_processes(lock):
             if _stored(folder, module, name)[0]:
@@ -152,13 +152,13 @@ def _seconds_shown(what: str) -> Iterator[None]:
 def _between_processes(path: Path) -> ExitStack:
     """Hold the file lock at `path` until the returned context ends.
 
-    The lock keeps other processes from compiling the same function. The operating system frees the
-    lock if this process dies. No lock is held if the package filelock is missing, if the folder is
-    not writable, or after a wait of `_LONGEST_WAIT`. At worst, two processes then compile the same
-    function.
+    The lock keeps other processes from compiling the same function. If this process dies, the
+    operating system frees the lock. The function continues without the lock if the package filelock
+    is missing, if the folder is not writable, or after a wait of `_LONGEST_WAIT`. At worst, two
+    processes compile the same function.
     """
     held = ExitStack()
-    # `Timeout` is an OSError. So the `Timeout` of the second wait is suppressed, too.
+    # The `Timeout` of the second wait is suppressed too, because `Timeout` is an OSError.
     with suppress(ImportError, OSError, NotImplementedError):
         from filelock import FileLock, Timeout
 
@@ -182,14 +182,14 @@ def is_kept(module: str, name: str) -> bool:
 
 
 def _stored(folder: Path, module: str, name: str) -> tuple[list[Path], list[Path]]:
-    """Return the index files of a function's machine code for this version of Python.
+    """Return numba's index files for the machine code of a function, for this version of Python.
 
     The first list has the files that are newer than all sources of the kernel. The second list has
     the older files.
     """
-    # The machine code of a function also contains the functions that it calls from other source
-    # files. numba compares the age of the code only with the source file of the function itself. So
-    # all source files are compared here.
+    # The machine code of a function includes called functions from other source files. numba checks
+    # only whether the machine code is older than the function's own source file. So this function
+    # compares the index files with all source files.
     source = max(file.stat().st_mtime for file in Path(__file__).parent.glob("*.py"))
     newer: list[Path] = []
     older: list[Path] = []

@@ -2,8 +2,8 @@ r"""M^-1, accelerations and their derivatives at many points, eight points at a 
 
 RNEA is differentiated in closed form. Let S be the spatial axis of a joint, and let v and a be the
 spatial velocity and acceleration of the joint's parent. Define Psi' = v x S and
-Psi'' = a x S + v x Psi'. If joint j is on the path from the base to joint i, the joint forces tau
-have the following derivatives with respect to the joint positions q and velocities q':
+Psi'' = a x S + v x Psi'. The derivatives of the joint forces tau with respect to the joint
+positions q and velocities q' are as follows, if joint j is on the path from the base to joint i:
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\
@@ -12,11 +12,11 @@ have the following derivatives with respect to the joint positions q and velocit
     \partial\tau_i/\partial q'_j &= (2 B_i^T S_i)^T S_j + 2 (I_i S_i)^T \Psi'_j
 
 Here I_i, B_i and f_i are the inertia, the Coriolis matrix and the spatial force of the subtree
-beyond joint i. Let p be the linear momentum of the subtree, and h its stored momentum, which is the
-sum of the momenta of its wheels without inertia. The matrix G is the sum of m v r^T over the mass
-points of the subtree, with the velocities v and the positions r from the joint. For a rotation with
-the angular velocity w, the force part of 2 B w is 2 w x p. The moment part is
-2 (tr(G) E - G) w + w x h, with the identity matrix E.
+beyond joint i. Let p be the linear momentum of the subtree. The stored momentum h is the sum of the
+momenta of those wheels in the subtree that have no inertia in the model. The matrix G is the sum of
+m v r^T over the mass points of the subtree. Each mass point has the mass m, the velocity v and the
+position r from the joint. For a rotation with the angular velocity w, the force part of 2 B w is
+2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
 
 References
 ----------
@@ -64,10 +64,10 @@ def _coriolis_transposed(work, at, along):
 
 
 def differentiate(work, tree):
-    """Write the derivatives of M c + b - B_u u minus spring and damper forces, at constant c.
+    """Write the derivatives of M c + b - B_u u - f at constant c, with spring and damper forces f.
 
-    The matrix (6 + n, 12 + 2 n) has one column for each coordinate of a displacement of the state,
-    in base axes.
+    The derivatives are a matrix (6 + n, 12 + 2 n). Each column is the derivative with respect to
+    one coordinate of a displacement of the state, in base axes.
     """
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
@@ -76,8 +76,8 @@ def differentiate(work, tree):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
-    # For each joint, write the derivatives of all forces with respect to its position and rate, and
-    # the derivatives of its force with respect to omega_b.
+    # For each joint, write the derivatives of all forces with respect to the joint's position and
+    # rate. Also write the derivatives of the joint's force with respect to omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         moving = tree.motion + body * MOTION
@@ -125,10 +125,10 @@ def differentiate(work, tree):
 
 
 def _push(work, tree, by_u):
-    """Write D_u (3.3), whose columns are the accelerations c per unit of each input.
+    """Write D_u (3.3). Each column contains the accelerations c per unit of one input.
 
-    The column of a body-fixed input is M^-1 times the column of B_u. The column of any other input
-    is a column of M^-1.
+    The column of a body-fixed input is M^-1 times the input's column of B_u. The column of any
+    other input is a column of M^-1.
     """
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
     for row in range(size):
@@ -151,8 +151,8 @@ def _solve(work, tree, slopes):
     """
     size, width = len(tree.row), 2 * len(tree.row)
     none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    # The first six columns are for the base's rotation and translation. They are zero, because the
-    # kernel supports no orbits.
+    # The first six columns are for the base's rotation and translation. These columns are zero,
+    # because the kernel supports no orbits.
     for row in range(size):
         vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
@@ -168,16 +168,17 @@ def _solve(work, tree, slopes):
 
 
 def _pack(rows, first, lanes):
-    """Copy eight rows, from `first` on, to the eight columns of `lanes` (entries, 8)."""
+    """Copy eight rows to the eight columns of `lanes` (entries, 8), beginning at row `first`."""
     for entry in range(len(lanes)):
         for lane in range(LANES):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
 def _unpack(work, start, entries, out, first, offset):
-    """Copy entries of `work` (.., 8), from `start` on, to eight rows of `out` from `first` on.
+    """Copy rows of `work` (.., 8) to columns of `out`, and the eight columns to eight rows.
 
-    In these rows, the entries begin at the column `offset`.
+    Row `start` and column 0 of `work` are copied to column `offset` and row `first` of `out`. The
+    number of copied rows of `work` is `entries`.
     """
     for entry in range(entries):
         for lane in range(LANES):
@@ -185,9 +186,9 @@ def _unpack(work, start, entries, out, first, offset):
 
 
 def derive(tree, points, out, lanes, work):
-    """Write the results of `RowAccelerations` to `out` at eight or more points.
+    """Compute the results of `RowAccelerations` at eight or more points, and write them to `out`.
 
-    For points at rest, `nu` is empty, and only D_u and the couplings are written.
+    For points at rest, `nu` is empty, and only D_u and the sums of the couplings are written.
     """
     q, nu, force, u = points
     c, A, by_u, judged = out
@@ -196,8 +197,8 @@ def derive(tree, points, out, lanes, work):
     inputs = slopes + size * 2 * size
     coupling = inputs + size * len(tree.driven)
     for block in range(0, len(q), LANES):
-        # If fewer than eight points are left, the last block begins earlier so that it fills all
-        # lanes. Some points of the previous block are then computed twice.
+        # If fewer than eight points are left, the last block begins at an earlier point, so that
+        # the block has eight points. Some points of the previous block are computed twice.
         first = min(block, len(q) - LANES)
         _pack(q, first, lanes.q)
         bodies.outwards(work, tree, lanes.q)
@@ -232,7 +233,7 @@ def derive(tree, points, out, lanes, work):
             _unpack(work, slopes, lower, A, first, A.shape[1] - lower)
 
 
-_FARTHEST = 1e6  # [rad] largest angle for which `vectors.cosine_and_sine` is accurate
+_FARTHEST = 1e6  # [rad] `vectors.cosine_and_sine` is accurate for angles below this value
 
 
 class Packed(namedtuple("Packed", "q nu force u")):
@@ -265,9 +266,9 @@ class RowAccelerations:
     ) -> tuple[Array, Mask]:
         """Write the derivatives of the accelerations c; return c (N, 6 + n) and the mask.
 
-        The derivatives with respect to displacements of the state are written to the lower half of
-        each matrix in A (N, nx, nx). D_u is written to `by_u`. A and `by_u` are C-contiguous, and
-        nu and u are in base axes.
+        The lower half of each matrix in A (N, nx, nx) receives the derivatives with respect to
+        displacements of the state. `by_u` receives D_u. A and `by_u` must be C-contiguous. nu and u
+        are in base axes.
         """
         force = u @ self._actuation.fixed.T
         force[:, 6:] += self.state.robot.springs.force(q_m, nu[:, 6:])
@@ -278,13 +279,14 @@ class RowAccelerations:
         judged = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,
-            # Read-only arrays are copied, because numba would compile a second function for them.
+            # Copy read-only arrays, because numba would compile a second function for such arrays.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
             (c, A, by_u.reshape(len(by_u), -1), judged),
             Packed(*map(work_space, self._sizes)),
             work_space(self._work),
         )
-        # If a pivot of M is zero, `judged` is NaN, and both comparisons are false.
+        # `judged` is the sum of the couplings. If a pivot of M is zero, the sum is NaN, and both
+        # comparisons are false.
         good = (self._least_coupling < judged) & (judged < WARNING_COUPLING)
         q_m = points[0][:, 7:]
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:

@@ -1,14 +1,15 @@
-r"""Forward dynamics of a robot with its inputs, springs and gravity, and its first integrals.
+r"""Forward dynamics of a robot with inputs, springs and gravity, and integrals of the motion.
 
 The accelerations c solve (3.1), with M from the composite rigid body algorithm and the bias from
-RNEA. The computation of c is in base axes, and does not use the position or the linear velocity of
-the base, because c does not depend on them. Momentum and centre of mass follow from the
-external wrench W by (11.2) of docs/derivation.md, as in `simulation.run`:
+RNEA. The computation of c is in base axes. Position and linear velocity of the base are not used,
+because c does not depend on them. Momentum and centre of mass follow from the external wrench W by
+(11.2) of docs/derivation.md, as in `simulation.run`:
 
 .. math:: H(t) = H(0) + \int W\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-H contains the linear momentum p, and then the angular momentum about the initial position of the
-base's origin. The centre of mass r_c is relative to the same point. Both are in world axes.
+The first half of H is the linear momentum p. The second half is the angular momentum about the
+initial position of the base's origin. The centre of mass r_c is relative to the same point. H and
+r_c are in world axes.
 """
 
 from collections import namedtuple
@@ -32,14 +33,15 @@ class Mechanics(
 
     - `tree`: the kinematic tree.
     - `gravity` (3,): gravity in world axes [m/s^2].
-    - `index`: for each joint, the index of its first entry in q.
-    - `circling`: for each joint, whether this entry is the cosine of the joint angle.
-    - `scale`: for each joint, the change of this entry per unit of q_m. It is 1 except for modal
-      amplitudes.
-    - `springy`: for each joint, whether it has a spring or a damper.
-    - `rest`: for each joint, the position at which its spring exerts no force.
-    - `triads`: for each torque or force on the base, the index of the first of its three inputs.
-    - `held`: the entries of `triads` for the torques and forces that are in reference axes.
+    - `index`: for each joint, the index in q of the first entry of the joint.
+    - `circling`: for each joint, whether its first entry in q is the cosine of the joint angle.
+    - `scale`: for each joint, the change of its first entry in q per unit of q_m. The value is 1
+      except for modal amplitudes.
+    - `springy`: for each joint, whether the joint has a spring or a damper.
+    - `rest`: for each joint, the position at which the spring exerts no force.
+    - `triads`: one index for each vector input, which is a torque or force on the base with three
+      components. The index is that of the first component among all inputs.
+    - `held`: the entries of `triads` for the vector inputs in reference axes.
     - `origin` (7,): placement of the world relative to the reference, as position and quaternion.
     - `faults`: the `ActuatorFaults`.
     """
@@ -48,9 +50,9 @@ class Mechanics(
 class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """Actuator faults: a command u produces the inputs gain u + bias (nu,).
 
-    Each input is 0 from the time `until` [s] on. For each torque or force on the base, `turn`
-    contains the three columns (9,) of a matrix. The columns are the directions in which the three
-    inputs of this torque or force actually act.
+    - `until` (nu,): for each input, the time [s] from which the input is 0.
+    - `turn`: for each vector input of `Mechanics.triads`, the three columns (9,) of a matrix. Each
+      column is the direction in which one of the three components actually acts.
     """
 
 
@@ -58,10 +60,10 @@ class Point(namedtuple("Point", "q nu u pushing wrench")):
     """Point of a robot: q (nq,), nu (6 + n,) in base axes, and inputs.
 
     - `u` (number of inputs,): the commanded inputs.
-    - `pushing` (number of inputs,): the inputs after faults, with the vectors on the base in base
-      axes.
-    - `wrench` (6,): moment and force of the inputs about the base's origin, in base axes. It is
-      from the last evaluation of the accelerations.
+    - `pushing` (number of inputs,): the inputs after faults. Torques and forces on the base are in
+      base axes.
+    - `wrench` (6,): moment and force of the inputs about the base's origin, in base axes, at the
+      last evaluation of the accelerations.
     """
 
 
@@ -131,7 +133,7 @@ def push(work, tree, pushing):
 def accelerate(work, robot, point, rates, to):
     """Write d(nu)/dt into `rates` from the index `to` on.
 
-    `configure` must be called before this function. M is overwritten by its factor.
+    `configure` must be called before this function. The factorisation of M overwrites M.
     """
     tree, nu = robot.tree, point.nu
     force, size = tree.c, len(tree.row)
@@ -158,7 +160,7 @@ def accelerate(work, robot, point, rates, to):
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
-# Offsets of the four vectors in `sums` of `MomentumReference`.
+# Offsets of the four vectors in `MomentumReference.sums`.
 IMPULSE, SHIFT, STEP_IMPULSE, STEP_SHIFT = 0, 6, 9, 15
 SUMS = 18
 
@@ -168,13 +170,13 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 
     All vectors are in world axes. The arrays may have a second axis of lanes.
 
-    - `start` (12,): the initial momentum (6,), the initial centre of mass (3,), and a point (3,).
-      Angular momentum and centre of mass are relative to this point.
+    - `start` (12,): the initial momentum (6,), the initial centre of mass (3,), and the point (3,)
+      relative to which angular momentum and centre of mass are measured.
     - `weight` (3,): mass times gravity.
     - `per_mass` (1,): 1 / mass.
-    - `sums` (18,): four vectors. The first two are for the time before the current step: impulse
-      (6,), and displacement (3,) of the centre of mass by the impulse. The other two are for the
-      current step: impulse (6,), and displacement (3,) multiplied by the mass.
+    - `sums` (18,): four vectors. The first two are for the time before the current step: the
+      impulse (6,), and the displacement (3,) of the centre of mass due to the impulse. The other
+      two are for the current step: the impulse (6,), and the displacement (3,) times the mass.
     """
 
 
@@ -184,8 +186,8 @@ MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 def add_wrench(work, robot, reference, point, weight, moment):
     """Add the external wrench at a stage of the integrator to the sums of the current step.
 
-    `weight` [s] is the weight of the stage in an integral over the step, and `moment` [s^2] is its
-    weight in a double integral.
+    `weight` [s] is the weight of the stage in an integral over the step. `moment` [s^2] is the
+    weight of the stage in a double integral.
     """
     axes = vec.axes_of(point.q)
     moments, force = vec.get6(point.wrench, 0)
@@ -202,9 +204,10 @@ def add_wrench(work, robot, reference, point, weight, moment):
 
 
 def end_step(reference, h):
-    """Finish a step of h [s]: add its sums to the sums before it, and set its sums to zero.
+    """Finish a step of h [s]: add the step's sums to the sums of the time before the step.
 
-    The impulse before the step also displaces the centre of mass during the step.
+    The sums of the step are set to zero. The impulse before the step also displaces the centre of
+    mass during the step.
     """
     per_mass = load(reference.per_mass, 0)
     shift = vec.times(vec.get3(reference.sums, IMPULSE), h)
@@ -226,9 +229,9 @@ def kept_at(reference, t):
 
 
 def start_at(work, robot, reference, point):
-    """Write the momentum and the centre of mass of the robot at its initial point to `start`.
+    """Write the robot's initial momentum and centre of mass into `reference.start`.
 
-    `configure` must be called before this function.
+    `point` is the initial point. `configure` must be called before this function.
     """
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
@@ -245,11 +248,11 @@ def start_at(work, robot, reference, point):
 def _momentum_error(work, robot, nu, momentum):
     """Return a given momentum minus the momentum of the robot at nu.
 
-    Both are (angular, linear) in base axes, about the base's origin.
+    Both momenta are (angular, linear) in base axes, about the base's origin.
     """
     tree = robot.tree
-    # The six base rows of M times nu are the momentum of the bodies. By symmetry, the column of a
-    # joint in these rows contains the first six entries of the joint's row in the packed M.
+    # The momentum of the bodies is the product of nu with the six base rows of M. By symmetry, the
+    # six entries of a joint in the base rows are the first six entries of the joint's row.
     error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
     for index in range(6, len(tree.row)):
         row = vec.get6(work, tree.packed + tree.row[index])
@@ -264,7 +267,7 @@ def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
     `configure` must be called before this function. The equations are solved for the correction of
-    the velocity and not for the velocity itself. The correction is small, and so are its rounding
+    the velocity, not for the velocity itself. The correction is small and has small rounding
     errors.
     """
     tree, nu = robot.tree, point.nu
@@ -277,8 +280,8 @@ def impose(work, robot, reference, point, t):
     angular = vec.across(axes, vec.minus(angular, vec.cross(position, linear)))
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
-    # Solve for the correction of omega_b with the robot's inertia about its centre of mass, and
-    # then for the correction of v_b.
+    # Compute the correction of omega_b with the robot's inertia about the robot's centre of mass.
+    # Compute the correction of v_b from the correction of omega_b.
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))
