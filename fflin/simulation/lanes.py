@@ -1,7 +1,8 @@
 """The compiled engine, which simulates eight runs in parallel.
 
-The last axis of every array has eight entries, called lanes, one for each run. If there are fewer
-than eight runs, the remaining lanes repeat the last run.
+An array whose values differ between the runs has eight entries in its last axis, one for each run.
+These entries are called lanes. If there are fewer than eight runs, the remaining lanes repeat the
+last run.
 """
 
 from collections.abc import Callable, Mapping
@@ -128,7 +129,7 @@ class Statistics:
 
 
 class LaneLoop:
-    """The compiled loop for a plan. Each thread needs its own loop, which contains work space.
+    """The compiled loop for a plan, with memory for eight runs; each thread needs its own loop.
 
     `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
     u, momentum and centre of mass. `ends` (5,) contains the column after each of these vectors.
@@ -139,7 +140,7 @@ class LaneLoop:
         if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
         stop = stop_conditions(plan)
-        if runs:  # the sign of each quaternion in `runs` is such that `stop.sign` is positive
+        if runs:  # the scalar part q0 of their attitudes is positive; see `StopConditions`
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
@@ -200,7 +201,7 @@ class LaneLoop:
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
                 # A stop condition in one lane stops the loop for all lanes. A finished lane would
-                # stop it again at every step, so it continues as a copy of a running lane.
+                # stop the loop again at every step, so the lane becomes a copy of a running lane.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:
@@ -234,7 +235,7 @@ class LaneLoop:
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            # If the end of a run interrupted the slice, its noise has been drawn already.
+            # If the end of a run interrupted a slice, the noise of the slice is drawn already.
             if not self._noisy or drawn == last:
                 return
             drawn = last
@@ -445,8 +446,8 @@ def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
     """Return the allocation of commands to the inputs of the simulated robot.
 
-    The commands are the inputs of the robot in `asking`. The simulated robot has the parameters
-    `giving`, and is the robot of `plant`.
+    The commands are for the inputs of the plant `asking`. The simulated robot is the robot of
+    `plant`, and has the kernel parameters `giving`.
     """
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
@@ -464,7 +465,7 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
 def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
-    """Return the trajectory and the gains of a policy.
+    """Return a copy of `path` with the trajectory and the gains of a policy.
 
     If the run is longer than the trajectory, the end point and its gain are appended.
     """

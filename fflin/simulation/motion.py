@@ -29,7 +29,7 @@ from fflin.simulation.report import Passed, Saturated, curves, motion_report, pa
 FORMATS = (*record.FORMATS, ".csv")
 
 # Largest accepted jump of a position or rate [SI units] from the end of a phase to the start of the
-# next. It is multiplied by the largest rate at the end of the phase, if this exceeds 1.
+# next. If the largest rate at the end of the phase exceeds 1, the value is multiplied by this rate.
 _MET = 1e-6
 
 

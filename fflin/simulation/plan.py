@@ -161,7 +161,7 @@ class Plan:
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
-        self.steered = fed_back(policy)  # states that are known to be fed back
+        self.steered = fed_back(policy)  # states that the policy feeds back, if known
         # Function of time that returns the measurement noise, if the policy defines it, or None.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
@@ -177,8 +177,9 @@ class Plan:
     def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
         """Return a function f(step, *point) that computes the inputs (nu,) of a step.
 
-        f calls `law` with `point` for the command, and `speeds` with `point` for the speeds of the
-        limited wheels. It then applies limits, sample and hold, and the delay.
+        f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds of the wheels
+        whose speed is limited. The actuator channel changes the command: limits, sample and hold,
+        delay and thruster pulses.
         """
         times = self.times
         return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
@@ -295,7 +296,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         )
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
-    # If not every step is recorded, record a sampled policy only at its samples.
+    # If the policy is sampled and not every step is recorded, record only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
     if thinned:
@@ -371,9 +372,9 @@ def _positive(name: str, value: object) -> float:
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
     """Return the time [s] after which the errors of the linear closed loop have settled.
 
-    The errors of attitude, position and joints have each settled once they stay below 1 % of their
-    largest value. The time is rounded up to a multiple of 10 s, and is at least SHORTEST. If the
-    loop does not settle before LONGEST, return SHORTEST.
+    The attitude error, the position error and the largest joint error must each stay below 1 % of
+    its maximum. The time is rounded up to a multiple of 10 s and is at least SHORTEST. If the loop
+    does not settle before LONGEST, return SHORTEST.
     """
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)

@@ -118,7 +118,7 @@ def plot_motion(
             if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
             if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
-                # Joint names are long, so one legend below the charts is valid for all of them.
+                # Joint names are long, so a legend below the charts names the joints of all charts.
                 named = legends.setdefault("joints" if group in JOINTS else title, {})
                 named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
             else:
@@ -149,7 +149,7 @@ def plot_motion(
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
-    """Return {chart title: curves} for the signals in `show`; a chart has only one unit."""
+    """Return {chart title: curves} for the signals in `show`; curves of a chart share a unit."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
@@ -164,7 +164,7 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
-    """Return what the panels below the states show, and {state: curve} for these panels.
+    """Return the label and the curves {state: curve} of the panels below the charts of states.
 
     If the motion follows a reference, the curves are the errors from the reference. Otherwise, they
     are the differences from the linear prediction. Without a prediction, there are no curves.

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 SETTLED = 0.02
 
 # If an error [SI units] never exceeds THERE, it counts as zero throughout the run. A value below
-# _NOTHING is shown as a dot. The rounding errors of a robot at rest are smaller than both values.
+# _NOTHING appears as a dot in tables. Rounding errors of a robot at rest are smaller than both.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# An error counts as settled only if it stays small during this last fraction of the rows of a run,
-# or longer.
+# An error counts as settled only if it stays small at least during the last rows of a run. Their
+# number is this fraction of all rows.
 DWELL = 0.05
 
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3
 
-_MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
+_MOST, _NAMED = 8, 4  # largest number of lines of a list, and of saturated inputs in a line
 
 _OF_PHASES = (
     "|p|: linear momentum; |h|: angular momentum about the centre of mass;\n"
@@ -63,7 +63,7 @@ class Curve(NamedTuple):
     """
 
     key: str  # GROUP.NAME
-    group: str  # "speed" and "momentum" of wheels
+    group: str  # "speed" or "momentum" for wheels
     name: str
     unit: str
     values: Array
@@ -83,7 +83,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits of which the values reach at least the fraction _NEAR."""
+        """Limits for which the largest value is at least _NEAR times the limit."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 
@@ -185,7 +185,7 @@ def _shown(value: float) -> str:
 
 
 def settled_at(sizes: Array) -> Indices:
-    """Return the row from which each error in `sizes` (N, ...) is settled, or N if it is never."""
+    """Return the row at which each error in `sizes` (N, ...) settles, or N if it never settles."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
@@ -231,9 +231,9 @@ def _cells(*values: float) -> list[str]:
 def error_sizes(motion: Motion) -> list[ErrorSize]:
     """Return the sizes of each kind of error, or an empty list if the motion has no target.
 
-    The size of attitude errors is the angle [deg]. For every other kind, it is the largest absolute
-    error of a state of this kind. Wheel speeds and modes are not counted as joints, but as separate
-    kinds. Wheel angles are excluded, because nothing depends on them.
+    The size of the attitude error is an angle [deg]. For every other kind, the size is the largest
+    absolute error of the states of this kind. Wheel speeds and modes are not counted as joints, but
+    as separate kinds. Wheel angles are excluded, because nothing depends on them.
     """
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -341,7 +341,7 @@ def _phases(motion: Motion) -> list[list[str]]:
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
         # A line of the table is (label, index of a row of the motion, energy and momentum that are
         # added to those of the row). The rows contain only the values after an impact. In the line
-        # for the time before it, the energy and momentum that the impact removed are added.
+        # "before", the energy and momentum that the impact removes are added to these values.
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)
@@ -383,7 +383,7 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
         said = f"settled: {which}at the target throughout the run"
     if aside:
         said += f"; not controlled: {_and(aside)}"
-    shares: dict[str, float] = {}  # of the run at a limit, summed over both limits
+    shares: dict[str, float] = {}  # fraction of the run at the lower or upper limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
     full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]

@@ -45,7 +45,7 @@ STOPS = ("", "diverged", "left the chart", "stopped")
 
 LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _LOOK = 16  # steps between checks of the clock
-_LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the number
+_LARGEST_SHOWN = 1e3  # [rad] largest rotation per step that a message states
 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
@@ -83,17 +83,17 @@ class Plant(Aba):
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,), and the wrench (6,) of inputs and disturbance on the whole robot.
+        """Return dv/dt (nv,), and the external wrench (6,) of inputs and disturbance.
 
-        The wrench consists of force and torque in base axes. It does not include gravity. In orbit,
-        the wrench is replaced by [power, 0, 0, 0, 0, 0], with the total power [W] of inputs,
-        disturbance and dampers.
+        The wrench consists of the force and the torque on the robot about the base, in base axes.
+        Gravity is not included. In orbit, the wrench is replaced by [power, 0, 0, 0, 0, 0], with
+        the total power [W] of inputs, disturbance and dampers.
         """
         if self._faulty:
             given = np.empty(len(u))
             apply_faults(self.faults, self.triads, t, u, given)
             u = given
-        if self.actuation.held:  # rotated by R instead of the chart, which is singular at 180 deg
+        if self.actuation.held:  # use R, because the chart is singular at 180 deg
             R, u = self.state.rotation(q), u.copy()
             for held in self.actuation.held:
                 u[held] = u[held].dot(R)
@@ -140,8 +140,8 @@ class Conserved:
     momentum: Array  # (6,) after the steps so far
     wrenches: tuple[Array, ...]  # (6,) about the fixed point at each stage; written by the caller
 
-    # The fixed point is the initial position of the base. About the origin of the world, momenta
-    # would have large rounding errors if the robot is far away from the origin.
+    # The fixed point is the initial position of the base. Far away from the world's origin, angular
+    # momentum about the origin would have large rounding errors.
 
     def __init__(self, plan: Plan) -> None:
         robot, start = plan.plant.robot, plan.q[:3]
@@ -175,7 +175,7 @@ class Conserved:
     def wrench(self, q: Array, push: Array) -> Array:
         """Return the wrench (6,) about the fixed point in world axes, including the weight.
 
-        `push` (6,) is the wrench in base axes without the weight. In orbit, `push` is returned.
+        `push` (6,) is the wrench in base axes without the weight. In orbit, return `push` itself.
         """
         if self._field:
             return push
@@ -201,7 +201,10 @@ class Conserved:
         return self._line.dot(self._time)
 
     def impose(self, t: float, q: Array, v: Array) -> None:
-        """Correct the base in `q` and `v` so that centre of mass and momentum are as predicted."""
+        """Correct the base position in `q` and the base velocity in `v`.
+
+        After the correction, centre of mass and momentum are equal to their predictions at time t.
+        """
         # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m), where c_b is the centre of
         # mass and H_b the momentum, both relative to the base and in base axes. The equation for
         # nu_b is solved for the correction of nu_b, which is small, and so are its rounding errors.
@@ -231,7 +234,8 @@ class Conserved:
         They are, in this order: energy (N,), momentum about the centre of mass (N, 6), centre of
         mass (N, 3), momentum about the fixed point (N, 6), and the upper bounds (2,) of linear and
         angular momentum (11.5). In orbit, the energy is the Jacobi integral. This integral and five
-        zeros replace the momentum about the fixed point, and its largest terms replace the bounds.
+        zeros replace the momentum about the fixed point. The size of the integral's largest terms
+        and a zero replace the bounds.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
@@ -241,8 +245,8 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             pin.ccrba(model, data, q_i, v_i)
-            # `ccrba` also computes this momentum, but sums it about the origin, which causes larger
-            # rounding errors.
+            # `ccrba` also computes the momentum about the centre of mass, but from sums about the
+            # origin, which have larger rounding errors.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
@@ -285,7 +289,7 @@ class Recording(NamedTuple):
     v: Array
     u: Array
     momentum: Array  # (N, 6) from the external impulse; see `Conserved`
-    center: Array  # (N, 3) centre of mass from this momentum
+    center: Array  # (N, 3) predicted centre of mass
     steps: int  # number of steps that were begun
     stopped: str  # reason if the run ended early, or an empty text
     engine: str  # name of the engine
@@ -300,7 +304,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
-    # Method that integrates the policy's own state, or None if the policy has no state.
+    # Function that integrates the state of the policy, or None if the policy has no state.
     follow = getattr(law.policy, "advance", None) if law else None
     weights = plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt

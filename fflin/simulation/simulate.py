@@ -310,7 +310,7 @@ def predictor(plan: Plan) -> Predictor | None:
         if policy is None:
             none = np.zeros(len(lin.u0))
             return lin, lambda _: none
-        gain = getattr(policy, "K", None)  # an allocation has none, because it is nonlinear
+        gain = getattr(policy, "K", None)  # an allocation is nonlinear and has no gain
         if own is not None and gain is not None:
             K, constant, _ = StateFeedback(own, gain).terms(state)
             at_point = constant - K @ lin.x0
@@ -332,10 +332,10 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     Return no rows if the model cannot predict a motion, or if the prediction is not finite.
     """
     lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
-    if lin is None:  # a model in discrete time without its motion between samples
+    if lin is None:  # a discrete-time model without its continuous-time model
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of their speeds in x
+    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of limited wheel speeds in x
     applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
