@@ -311,9 +311,9 @@ class ModelDerivatives:
 
 
 def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:
-    """Change the bodies of `model` that depend on a parameter.
+    """Set the bodies of `model` that depend on a parameter.
 
-    They become the bodies of the model `before`, with the parameter changed by `size`.
+    The parameter gets the value that it has in the model `before`, plus `size`.
     """
     for joint, change in one.bodies.items():
         changed = before.inertias[joint].toDynamicParameters() + size * change

@@ -228,10 +228,10 @@ def linear_fractional(
 ) -> LFT:
     """Return the LFT of a model about an operating point at rest, without steady forces."""
     form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
-    # Terms of M can contain products of two parameters of the same link, and stiffnesses and
-    # dampings can contain products of two parameters of the same mode. Therefore all parameters of
-    # a link or mode are added together. `together` is {(link or mode, joint): {part: index of the
-    # parameter}}.
+    # M contains products of the parameters of a link, such as mass and centre of mass. The damping
+    # force of a mode contains the product of its frequency and damping ratio. Therefore all
+    # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
+    # index of the parameter}}.
     together: dict[tuple[str, int], dict[str, int]] = {}
     sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
     modes = sprung & {joint.name for joint in ready.robot.modes}

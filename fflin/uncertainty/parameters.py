@@ -39,7 +39,7 @@ class Parameter:
     # dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz, yz,
     # zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    joint: int = -1  # joint whose spring or damper changes, in state order; -1 for none
+    joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
     # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). The wrench is the
@@ -76,9 +76,11 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return the names of all parameters that match `only`, or of all parameters for None.
+        """Return the names of the parameters that match `only`.
 
-        The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern.
+        The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern. If
+        `only` is None, all parameters match.
+
         Parameters of a body of several links are left out if other parameters match.
         """
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
@@ -89,7 +91,7 @@ class Parameters(dict[str, Parameter]):
         """Return why {parameter: value} is not physically realisable, or an empty string."""
         try:
             self._bodies(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
+            if self._robot.wheels or self._robot.modes:  # a link may be too light to carry them
                 self.robot(values)
         except InputError as error:
             return str(error)

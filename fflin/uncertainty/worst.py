@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _CORNERS = 256
 # Largest number of steps of a local search, and trial lengths of a step relative to half a range.
-# Steps that leave the range are cut at its ends, so the length 1e9 leads to a corner of the set.
+# Steps are cut off at the ends of the ranges, so the length 1e9 leads to a corner of the set.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # In each step, the exact criterion is computed for _HELD trial points. The quick criterion uses
 # _FREQUENCIES frequencies. Gradients are finite differences with the step _DIFFERENCE.
@@ -319,7 +319,10 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound for frequencies a to b, its scaling, and the bound at the middle."""
+        """Return the bound for all frequencies from a to b, its scaling, and a second bound.
+
+        The second bound is only for the frequency in the middle.
+        """
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]

@@ -133,8 +133,8 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             # The browser writes its temporary files into this folder, which is removed at the end.
-            # The browser also creates a socket in it, whose path may have at most about 100
-            # characters. So if the path of this folder is long, the browser uses its default one.
+            # The browser also creates a socket in its folder. The path of a socket may have at most
+            # about 100 characters, so a folder with a long path is not given to the browser.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )

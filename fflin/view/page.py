@@ -46,7 +46,7 @@ _APART = 0.1
 # The axis of a cylinder is y in three.js, and z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
-# {type of an array: its extension type of msgpack-lite, and the typed array that the page decodes}.
+# {type of an array: (extension type of msgpack-lite, name of the typed array in JavaScript)}.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
 # Placeholder for a mesh that has already been sent to the page.
@@ -192,7 +192,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
     known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
     mass = known.mass if known else 0.0
-    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # its inertia is drawn
+    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # an inertia box
         mass = robot.model.inertias[shape.joint].mass
     return [mass, *pin.SE3ToXYZQUAT(shape.at).round(6).tolist()]
 
@@ -384,7 +384,7 @@ class Page:
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
             apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
-            # A wheel whose speed is a state is drawn with the rotation of its joint's node.
+            # If the speed of a wheel is a state, the drawn wheel rotates with its joint's node.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         # A live page receives the meshcat commands from the server. Other pages contain these

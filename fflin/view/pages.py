@@ -37,8 +37,8 @@ from fflin.view.shapes import carriers_of
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-# Relative to the robot's size: ARROW is the length of the arrow that represents the largest force.
-# If the motion extends over more than _FAR, the camera follows the base by default.
+# ARROW is the length of the arrow for the largest force. If the motion extends over more than _FAR,
+# the camera follows the base by default. Both lengths are relative to the robot's size.
 ARROW, _FAR = 0.62, 20.0
 
 # The flight of a payload before its capture is integrated in steps. _STEP is the longest step [s].
@@ -66,7 +66,7 @@ def motion_page(
     frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:  # none, one, or one for each frame
+    if target is None:  # `states` is empty, or has one target, or one for each frame
         states = motion.target.reshape(-1, state.nx)
         states = states[shown] if len(states) > 1 else states
         goal = state.points(states)[1]

@@ -39,13 +39,13 @@ class Shape:
 
     joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
-    size: tuple[float, ...]  # side lengths; radius; radius and length [m]; or a mesh's scale
+    size: tuple[float, ...]  # [m] sides, radius, or radius and length; scale of a mesh
     placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
     color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
-    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # of the link in the joint's frame
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's placement on the joint
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -195,11 +195,11 @@ class Bending(NamedTuple):
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
-    carrier: int  # Pinocchio joint
+    carrier: int  # Pinocchio joint that carries the appendage
     frame: pin.SE3  # placement on the carrier
     modes: list[int]  # indices in q
     twist: Array  # (6, k) per unit of q: translation before rotation
-    center: Array  # (3,) position in the frame of a ball that represents the links
+    center: Array  # (3,) centre, in `frame`, of a ball that represents the links
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement, in the world, of the appendage's frame after bending."""
@@ -337,7 +337,7 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
         found = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
             color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
-            if color is not None:  # None stands for a texture, or nothing
+            if color is not None:  # None if the file gives a texture or no colour
                 r, g, b, a = (float(x) / 255.0 for x in color)
                 color = r, g, b, a or 1.0
             found.append((mesh.vertices, mesh.faces, color))
