@@ -309,7 +309,7 @@ class _Form:
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 
     def parts(self, signals: Array) -> list[Array]:
-        """Split signals (.., k) into views of their coefficients of a, x, u and w."""
+        """Split signals (N, k) into views of their coefficients of a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
     def times(self, at: int, signals: Array) -> Array:

@@ -134,7 +134,7 @@ class Parameters(dict[str, Parameter]):
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
         """Return {joint: body} for all bodies with a changed link.
 
-        The joint indices are the ones of the Pinocchio model without wheels. If a changed link is
+        The joints are numbered as in the Pinocchio model without wheels. If a changed link is
         not physically realisable, raise `InputError`.
         """
         model, bare = self._robot.model, self._robot._bare.model

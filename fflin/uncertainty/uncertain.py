@@ -115,7 +115,7 @@ class Uncertain:
         return known.robot(found)
 
     def refusal(self, delta: Array) -> str:
-        """Return why the robot with deltas (k,) is not physically realisable, or an empty text."""
+        """Return why the robot with deltas (k,) is not physically realisable, or ""."""
         values = dict[str, float]()
         for block, d in zip(self.blocks, delta, strict=True):
             values |= block.values(block.middle + block.half * d)

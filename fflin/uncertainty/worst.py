@@ -156,7 +156,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
 
 
 class Gain(NamedTuple):
-    """Channel whose gain is bounded: from w to C x + D w, with the input disturbance scale * w."""
+    """Channel from w to C x + D w, where scale * w is a disturbance at the inputs."""
 
     C: Array
     D: Array
@@ -319,10 +319,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound for all frequencies from a to b, its scaling, and a second bound.
-
-        The second bound is only for the frequency in the middle.
-        """
+        """Return the bound for frequencies in [a, b], its scaling, and the bound at (a + b)/2."""
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
