@@ -1,7 +1,8 @@
 r"""Derivatives of a linear model with respect to the robot's parameters.
 
-M and RNEA are linear in the ten dynamic parameters of each body. So their derivative with respect
-to a dynamic parameter is M or RNEA of a robot in which this parameter is 1 and all others are 0.
+The inertia matrix M and the inverse dynamics (RNEA) are linear in the ten dynamic parameters of
+each body. So the derivative of M with respect to one of these parameters is M of a robot in which
+this parameter is 1 and all others are 0. The same is true for RNEA.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,8 @@ WEIGH = (CenterOfMass, Momentum)
 
 # Relative change of M in one step of the finite differences.
 _STEP = 2e-3
-# If this step changes A or B by less than this fraction, the change is lost in rounding errors.
+# If a step changes A by less than this fraction of A, rounding errors dominate the finite
+# differences. Errors of dA are then relative to this fraction of A. The same applies to B.
 _LEAST = 1e-6
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -88,10 +90,10 @@ class ModelDerivatives:
         self._joints = range(ROOT, robot.model.njoints)
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
-        """Return dA, dB, dC, dD, df0 and dy0 (P, ..), one row per parameter."""
-        # `assemble` is an affine function of the acceleration derivatives in `rates`. The last row,
-        # which has no parameter, is zero in `rates`. It gives the constant part of A, B and f0,
-        # which is subtracted below.
+        """Return dA, dB, dC, dD, df0 and dy0 (P, ..), one entry for each of P parameters."""
+        # Row i of `rates` belongs to parameter i. One more row, the last, contains zeros. Because
+        # `assemble` is an affine function of `rates`, this last row gives the constant part of A,
+        # B and f0, which is subtracted below.
         state, ready, count, nv = self._state, self._ready, len(parameters) + 1, len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
@@ -122,9 +124,9 @@ class ModelDerivatives:
 
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # These outputs are multiplied by the robot's mass. If the accelerations change linearly
-        # with a parameter, the products are quadratic in the parameter. So a difference of three
-        # values is exact for any step.
+        # Each of these outputs, multiplied by the robot's mass, is a quadratic function of the
+        # parameter, because `weighed` changes the accelerations linearly. So the derivative
+        # follows exactly from three values with any step, see (12.2a).
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -157,7 +159,7 @@ class ModelDerivatives:
         return found
 
     def difference(self, one: Parameter) -> float:
-        """Return the relative difference of dA and dB from fourth-order finite differences."""
+        """Return the relative difference between dA, dB and fourth-order finite differences."""
         if not one.bodies:
             raise InputError(
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -183,10 +185,10 @@ class ModelDerivatives:
 
     @cached_property
     def _of_bodies(self) -> AccelerationDerivatives:
-        """Derivatives (bodies, 10, ..) of the rates with respect to the dynamic parameters.
+        """Derivatives (bodies, 10, ..) of `_rates` with respect to the dynamic parameters.
 
-        The rates are the accelerations and their derivatives. The bodies are in Pinocchio's joint
-        order.
+        `_rates` contains the accelerations and their derivatives with respect to state and inputs.
+        The bodies are in the order of Pinocchio's joints.
         """
         rates = self._rates
         by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
@@ -195,8 +197,8 @@ class ModelDerivatives:
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            # RNEA of a model with a single body gives the body's F_p and the derivatives of F_p
-            # with respect to q_m, nu and base rotations.
+            # If only one body of the model has an inertia, RNEA returns F_p of (12.1) for this
+            # body, and the derivatives of F_p with respect to q_m, nu and base rotations.
             lone = self.robot.model.copy()
             lone.armature = np.zeros_like(lone.armature)
             for joint in range(lone.njoints):
@@ -221,7 +223,10 @@ class ModelDerivatives:
         return found
 
     def fraction(self, changes: Mapping[int, Array]) -> float:
-        """Return the largest relative change of M: the spectral radius of M^-1 times the change."""
+        """Return the relative size of a change dM of M: the spectral radius of M^-1 dM.
+
+        `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of its body}.
+        """
         of_bodies = self._by_inertia(np.eye(len(self._inverse)))
         total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())
         return float(np.abs(np.linalg.eigvals(total)).max())
@@ -234,13 +239,16 @@ class ModelDerivatives:
         return np.array([self._state.columns(J) for J in full])
 
     def _by_inertia(self, given: Array) -> Array:
-        """Return the products (bodies, 10, 6 + n, k) of -M^-1 M_p and a given matrix (6 + n, k)."""
+        """Return the products (bodies, 10, 6 + n, k) of -M^-1 M_p and a given matrix (6 + n, k).
+
+        M_p is the derivative of M with respect to a dynamic parameter p of a body.
+        """
         J = self._jacobians()
         forces = UNITS @ (J @ given)[:, None]
         return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
-        """Return the forces of RNEA and their derivatives.
+        """Return the generalised forces that RNEA computes, and their derivatives.
 
         The derivatives are with respect to q_m, nu and base rotations. The forces of springs and
         inputs are not included.
@@ -270,10 +278,10 @@ class ModelDerivatives:
         return self._state.project(by_q)[:, 6:]
 
     def _over_force(self, one: Parameter) -> AccelerationDerivatives:
-        """Return the derivatives of the rates with respect to a parameter that changes no body.
+        """Return the derivatives of `_rates` with respect to a parameter that changes no body.
 
-        The rates are the accelerations and their derivatives. The parameter changes a spring, a
-        damper or the wrench of an input.
+        `_rates` contains the accelerations and their derivatives with respect to state and inputs.
+        The parameter changes a spring, a damper or the wrench of an input.
         """
         state, u, size = self._state, self._u, len(self._inverse)
         F: Array = np.zeros(size)
@@ -303,7 +311,10 @@ class ModelDerivatives:
 
 
 def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:
-    """Set the bodies of `model` to the bodies of `before` after a change `size` of a parameter."""
+    """Set the bodies of `model` that depend on a parameter.
+
+    The parameter gets the value that it has in the model `before`, plus `size`.
+    """
     for joint, change in one.bodies.items():
         changed = before.inertias[joint].toDynamicParameters() + size * change
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(changed)

@@ -1,23 +1,26 @@
 r"""Linear-fractional models: A and B as exact functions of uncertain parameters.
 
 :math:`\dot x = A x + B_1 w + B_2 u,\; z = C_1 x + D_{11} w + D_{12} u,\; w = \Delta z` with
-:math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`, each :math:`\delta_k` between -1 and 1.
+:math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`. Here :math:`\delta_k` is between -1 and 1, and
+:math:`E_{r_k}` is the identity of size :math:`r_k`.
 
-The accelerations a of the robot need the following generalised force F for each link:
+If the robot has the generalised accelerations a, the inertial force of each link is the generalised
+force F:
 
     s = T X a,   f = D s,   F = X^T T^T f
 
 X is the Jacobian of the link's centre of mass in the axes of its inertia, and D = blkdiag(m E, I)
 contains the mass m and the inertia I. T shifts an uncertain centre of mass; it is the identity E if
-the centre of mass is known. Each parameter multiplies the following number of signals:
+the centre of mass is known. Each parameter of a link multiplies :math:`r_k` signals:
 
 - 3 for a mass,
 - 6 for a density,
 - 1 for a diagonal entry of the inertia, and 2 for an off-diagonal entry,
 - 4 for a coordinate of the centre of mass: 2 in T and 2 in T^T.
 
-These numbers are minimal. Each of them is the rank of the change of the inertia matrix M with the
-parameter, because X has full rank on a free base.
+These numbers are minimal: no :math:`r_k` can be smaller than the rank of the derivative of the
+inertia matrix M with respect to the parameter, and these numbers are equal to this rank. The reason
+is that X has full rank on a free base.
 """
 
 from __future__ import annotations
@@ -162,7 +165,7 @@ class LFT(Design):
             raise InputError(
                 "the inertia M is singular at these parameters; give narrower ranges"
             ) from None
-        # Signals w per unit of the states and of the inputs.
+        # Derivatives of w with respect to the states and the inputs.
         x, u = np.split(delta[..., None] * z, [len(self.A)], axis=-1)
         A, B = self.A + self.B1 @ x, self.B2 + self.B1 @ u
         return A, B, self.C2 + self.D21 @ x, self.D22 + self.D21 @ u
@@ -211,22 +214,24 @@ class Block(NamedTuple):
     ranges: tuple[Range, ...]
 
     def values(self, value: float) -> dict[str, float]:
-        """Return {parameter: value} for the block's common value or factor, given as `value`."""
+        """Return {parameter: value} if the block's common value or factor is `value`."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
 
-# Largest number of signals that one parameter multiplies. A density multiplies this number.
+# Largest number of signals that one parameter multiplies: 6 for a density.
 _MOST = 6
 
 
 def linear_fractional(
     lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
 ) -> LFT:
-    """Return the LFT of a model about an operating point at rest, without forces."""
+    """Return the LFT of a model about an operating point at rest, without steady forces."""
     form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
-    # Parameters of the same link or mode multiply each other's signals, so each link or mode is
-    # added with all its parameters: {(link or mode, joint): {part: index of the parameter}}.
+    # M contains products of the parameters of a link, such as mass and centre of mass. The damping
+    # force of a mode contains the product of its frequency and damping ratio. Therefore all
+    # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
+    # index of the parameter}}.
     together: dict[tuple[str, int], dict[str, int]] = {}
     sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
     modes = sprung & {joint.name for joint in ready.robot.modes}
@@ -272,8 +277,9 @@ def linear_fractional(
 class _Form:
     """Linear-fractional form under construction.
 
-    A signal is a row of coefficients of (a, x, u, w). Each parameter adds rows to z, and terms to
-    the force.
+    A signal, such as an entry of z or of the force, is a linear combination of the entries of
+    (a, x, u, w). It is stored as the row of its coefficients. Each parameter adds entries to z, and
+    terms to the force.
     """
 
     def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
@@ -291,7 +297,7 @@ class _Form:
         self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
-        # z has _MOST rows for every parameter. `used` counts the rows that a parameter needs.
+        # `z` reserves _MOST rows for each parameter. `used` counts the rows that are in use.
         self.used = np.zeros(len(ranges), dtype=np.intp)
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
         # Inertial forces plus spring and damper forces minus input forces. By the equation of
@@ -303,15 +309,15 @@ class _Form:
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 
     def parts(self, signals: Array) -> list[Array]:
-        """Return views of the signals' coefficients of a, x, u and w."""
+        """Split signals (N, k) into views of their coefficients of a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
     def times(self, at: int, signals: Array) -> Array:
         """Multiply signals by the change of a parameter from its nominal value.
 
-        The result is (shift + half * delta) * signals. The shift is the difference between the
-        middle of the range and the nominal value. The product half * signals is added to z, and the
-        product delta * half * signals is a new w.
+        The result is (shift + half * delta) * signals, where shift is the middle of the range minus
+        the nominal value. The products half * signals become new entries of z. So the products
+        delta * half * signals are the new entries of w.
         """
         (one, middle, half), first = self.ranges[at], _MOST * at + self.used[at]
         rows = slice(first, first + len(signals))
@@ -320,7 +326,7 @@ class _Form:
         return (middle - one.value) * signals + self.unit[self.ends[2] :][rows]
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
-        """Replace the nominal inertial force of a link by the force with uncertain parameters."""
+        """Replace the nominal inertial force of a link by its force with uncertain parameters."""
         J = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
         shifts = []
         for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
@@ -351,7 +357,11 @@ class _Form:
         self.force += J.T @ (back - D @ now)
 
     def add_alone(self, at: int) -> None:
-        """Add the effect of a parameter of a joint, thruster or wheel, independent of others."""
+        """Add the effect of a parameter of a joint, thruster or wheel.
+
+        M, the spring and damper forces, and the input forces contain no product of this parameter
+        and another one. So it is added alone.
+        """
         one = self.ranges[at].parameter
         if one.joint >= 0:
             rate = self.x[[self.state.groups.qdot_m.start + one.joint]]
@@ -376,7 +386,8 @@ class _Form:
     def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
         """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta dx/dt).
 
-        I is the inertia of the mode. Its frequency omega or damping ratio zeta can be uncertain.
+        I is the inertia of the mode. The frequency omega and the damping ratio zeta of the mode can
+        be uncertain.
         """
         joint, springs = self.state.robot.joints[index], self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]

@@ -29,25 +29,26 @@ _TURN = 2.0 * math.pi  # [rad]
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter, such as "inertia.xx" of "arm", and the change of the robot per unit."""
+    """Parameter, such as "inertia.xx" of "arm", and its effect: how the robot changes per unit."""
 
     of: str
     part: str
     unit: str
     value: float
-    # {Pinocchio joint: change (10,) of its body per unit}. The ten dynamic parameters are the mass
-    # m, the vector m c, and the entries xx, xy, yy, xz, yz, zz of the inertia about the joint.
+    # {Pinocchio joint: change (10,), per unit, of the dynamic parameters of its body}. The ten
+    # dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz, yz,
+    # zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    joint: int = -1  # joint whose spring or damper changes, in state order; -1 for none
+    joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, wrench (6,)). The wrench is in the joint's frame; it is
-    # the change, per unit, of the wrench that an input of 1 applies.
+    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). The wrench is the
+    # derivative, with respect to this parameter, of the wrench that an input of 1 applies.
     wrench: tuple[int, int, Array] | None = None
 
     @property
     def name(self) -> str:
-        """Name of the parameter: its owner and its part, such as "arm.inertia.xx"."""
+        """Name OWNER.PART of the parameter, such as "arm.inertia.xx"."""
         return f"{self.of}.{self.part}"
 
 
@@ -75,7 +76,10 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return the names that match an owner, part, name or pattern.
+        """Return the names of the parameters that match `only`.
+
+        The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern. If
+        `only` is None, all parameters match.
 
         Parameters of a body of several links are left out if other parameters match.
         """
@@ -87,7 +91,7 @@ class Parameters(dict[str, Parameter]):
         """Return why {parameter: value} is not physically realisable, or an empty string."""
         try:
             self._bodies(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
+            if self._robot.wheels or self._robot.modes:  # a link may be too light to carry them
                 self.robot(values)
         except InputError as error:
             return str(error)
@@ -128,9 +132,10 @@ class Parameters(dict[str, Parameter]):
         return found
 
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
-        """Return {joint: body} for bodies with changed links, or raise `InputError`.
+        """Return {joint: body} for all bodies with a changed link.
 
-        The joints and the bodies are numbered as in the Pinocchio model without wheels.
+        The joints are numbered as in the Pinocchio model without wheels. If a changed link is
+        not physically realisable, raise `InputError`.
         """
         model, bare = self._robot.model, self._robot._bare.model
         found: dict[int, Array] = {}
@@ -224,8 +229,8 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
             joint, placement = find_frame(robot.model, item.frame)
             where, along = np.array(item.position), np.array(item.direction)
             for letter, d in zip(AXES, np.eye(3), strict=True):
-                # The direction is normalised, so only the component of d that is perpendicular to
-                # the direction changes it.
+                # The sum of the direction and a small vector along d is normalised. So only the
+                # component of d that is perpendicular to the direction has an effect.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
                 tilted = np.concatenate((turned, np.cross(where, turned)))

@@ -115,7 +115,7 @@ class Uncertain:
         return known.robot(found)
 
     def refusal(self, delta: Array) -> str:
-        """Return why the robot with deltas (k,) is not physically realisable, or an empty text."""
+        """Return why the robot with deltas (k,) is not physically realisable, or ""."""
         values = dict[str, float]()
         for block, d in zip(self.blocks, delta, strict=True):
             values |= block.values(block.middle + block.half * d)
@@ -311,7 +311,7 @@ def _range(one: Parameter, value: object) -> Range:
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
-    # "inertia" without an entry is the inertia of a wheel.
+    # The part "inertia", without an entry such as "xx", is the inertia of a wheel.
     if least <= 0.0 and one.part in ("mass", "density", "inertia", "frequency"):
         expected = "values above 0"
     if expected:
@@ -323,7 +323,7 @@ def _range(one: Parameter, value: object) -> Range:
 
 
 def _tied(key: str, ranges: list[Range], value: object) -> Block:
-    """Return the block of several tied parameters, which one delta varies."""
+    """Return the block of several tied parameters, which vary with one common delta."""
     units = {each.parameter.unit for each in ranges}
     if isinstance(value, tuple | list):
         if len(units) > 1:
@@ -334,7 +334,7 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(number(key, value))
-    # A relative half width has the sign of the nominal value, so that delta > 0 increases the
-    # magnitude of the parameter.
+    # The half width of each parameter has the sign of its nominal value. So a positive delta
+    # increases the magnitudes of all tied parameters.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _CORNERS = 256
 # Largest number of steps of a local search, and trial lengths of a step relative to half a range.
-# The length 1e9 leads to a corner of the set.
+# Steps are cut off at the ends of the ranges, so the length 1e9 leads to a corner of the set.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # In each step, the exact criterion is computed for _HELD trial points. The quick criterion uses
 # _FREQUENCIES frequencies. Gradients are finite differences with the step _DIFFERENCE.
@@ -31,11 +31,12 @@ _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# Largest number of signals for which slycot is used, because the time that slycot takes grows with
-# the fifth power of the number of signals.
+# slycot is used for at most this number of signals, because its run time grows with the fifth power
+# of the number of signals.
 _SIGNALS = 24
 # _LOOK is the number of frequencies in the first grid. _INSIDE is the number of frequencies checked
-# in an interval. Each of at most _DIVISIONS steps divides an interval or calls slycot.
+# in an interval. _DIVISIONS is the largest number of steps, each of which divides an interval or
+# calls slycot.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
 # The search ends if the largest bound of an interval is at most this factor times the largest bound
 # at a single frequency.
@@ -126,7 +127,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([not of.refusal(corner) for corner in corners])
-    # Draws come last, so that a search with more draws begins as a search with fewer draws.
+    # The random draws come last. So a search with more draws first repeats the search with fewer.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
@@ -155,7 +156,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
 
 
 class Gain(NamedTuple):
-    """Channel whose gain is bounded: from w to C x + D w, with the input disturbance scale * w."""
+    """Channel from w to C x + D w, where scale * w is a disturbance at the inputs."""
 
     C: Array
     D: Array
@@ -191,7 +192,7 @@ class Loops:
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
     def figures(self, of: Gain) -> Figures:
-        """Return the functions for the criterion "largest gain" of a channel."""
+        """Return the functions for the criterion "largest gain" of the channel `of`."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
@@ -221,8 +222,9 @@ class Loops:
 def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
     """Return the largest criterion found by local searches, and its deltas.
 
-    A search starts at the first sample, and at each sample whose criterion exceeds the result so
-    far. So no sample exceeds the result, and further samples cannot decrease the result.
+    The first search starts at the first sample. A new search starts at each later sample whose
+    criterion exceeds the largest one found so far. So the result is at least the criterion of every
+    sample, and cannot decrease if more samples are appended.
     """
     best, at = _climbed(figures, tried[0], refuse)
     ahead = tried[1:]
@@ -234,7 +236,7 @@ def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> 
 
 
 def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
-    """Maximise a criterion locally; a step follows the gradient, or moves one delta to an end."""
+    """Maximise a criterion locally; a step follows the gradient, or sets one delta to -1 or 1."""
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
     for _ in range(_STEPS):
@@ -255,7 +257,10 @@ def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> 
 
 
 def _safe(loops: Loops) -> float:
-    """Return the inverse of the largest bound of mu; a set scaled by less is proved stable."""
+    """Return the inverse of the largest bound of mu over all frequencies.
+
+    If all ranges are scaled by less than this factor, all loops are stable.
+    """
     lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
@@ -269,8 +274,9 @@ def _safe(loops: Loops) -> float:
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
-# parameters, mu can be a discontinuous function of the frequency, so bounds at the frequencies of a
-# grid do not hold between them. Therefore one scaling is used for a whole interval of frequencies.
+# parameters, mu can be a discontinuous function of the frequency. So a bound at two frequencies
+# need not hold between them. But the bound that a fixed scaling gives is a continuous function of
+# the frequency. Therefore one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:
@@ -288,9 +294,10 @@ def perron(Z: Array) -> Array:
 
 
 def bound_of(Z: Array, scaling: Scaling) -> float:
-    """Return the least upper bound b of mu that a scaling proves for all matrices Z (k, n, n).
+    """Return the upper bound b of mu that a scaling (d, g) gives for all matrices Z (k, n, n).
 
-    With D = diag(d) and G = diag(g), each matrix satisfies Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2.
+    With D = diag(d) and G = diag(g), b is the smallest number >= 0 for which all matrices satisfy
+    Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2.
     """
     d, g = scaling
     scaled, turned = d[:, None] * Z / d, (g / d)[:, None] * Z / d
@@ -312,7 +319,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound for an interval, its scaling, and the bound at the middle frequency."""
+        """Return the bound for frequencies in [a, b], its scaling, and the bound at (a + b)/2."""
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -353,8 +360,8 @@ def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
         return found
     if 0 < len(blocks) and len(Z) <= _SIGNALS:
         try:
-            # AB13MD has no repeated real blocks. A delta of one signal is a real block; a delta of
-            # several signals is entered as a full complex block.
+            # AB13MD does not support repeated real blocks. A delta that occurs once is a real
+            # block; a delta that occurs several times is entered as a full complex block.
             _, d, g, *_ = ab13md(Z, blocks, np.where(blocks == 1, 1, 2))
         except SlycotArithmeticError:
             return found

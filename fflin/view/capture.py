@@ -24,7 +24,7 @@ _NAMES = (
     *("microsoft-edge", "msedge"),
 )
 
-# Options for WebGL without a graphics card, and for no background network access.
+# Options that enable WebGL without a graphics card, and disable background network access.
 _ARGUMENTS = (
     *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
@@ -34,7 +34,7 @@ _ARGUMENTS = (
 )
 
 # Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It exits when
-# they are closed, so it never outlives this process.
+# these pipes are closed, as they are at the end of this process.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
@@ -56,7 +56,7 @@ def find_chromium() -> str:
 
 
 def take_png(page: str, times: Sequence[float]) -> bytes:
-    """Return a PNG of a motion's page at one time [s], or a strip of several pictures."""
+    """Return a PNG of a motion's page at one time [s], or a strip with one picture per time."""
     if len(times) == 1:
         return _film(page, times, _PICTURE, -1)[0]
     from PIL import Image
@@ -90,8 +90,8 @@ def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
 def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
     """Return a PNG of the page at each time.
 
-    The pictures show only the scene; the first `keys` of them also show a legend. If `keys` is
-    negative, all pictures show the whole page.
+    If `keys` is negative, all pictures show the whole page. Otherwise, they show only the scene.
+    The first pictures also show a legend; their number is `keys`.
     """
     program = find_chromium()
     try:
@@ -133,8 +133,8 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             # The browser writes its temporary files into this folder, which is removed at the end.
-            # A folder with a long name is not used, because the path of a socket in it is limited
-            # to about 100 characters.
+            # The browser also creates a socket in its folder. The path of a socket may have at most
+            # about 100 characters, so a folder with a long path is not given to the browser.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
@@ -145,8 +145,8 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
                 timer.start()
                 browser = _Browser(process)
                 yield browser, folder
-                # Without commands, the browser exits and removes its temporary files. A killed
-                # browser would leave them.
+                # When its command pipe is closed, the browser exits and removes its temporary
+                # files. If it were killed at once, these files would remain.
                 browser.commands.close()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(5.0)
@@ -173,7 +173,8 @@ class _Browser:
         self.commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
-        # Tab to which commands are sent; if empty, they are sent to the browser.
+        # Session of the tab to which commands are sent. If it is empty, commands are sent to the
+        # browser itself, for example to create the tab.
         self._session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)

@@ -1,4 +1,4 @@
-"""Live viewer: a page that a thread of this process serves to this machine only."""
+"""Live viewer: a page in a browser of this machine, served by a thread of this process."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Live:
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
             self.q, self._state = q, json.dumps(state)
-        # A slow browser skips states for which there is a newer one.
+        # A slow browser receives only the newest state, and skips the older states.
         self._each(_Socket.update)
 
     def __call__(self, t: float, q: Array, *_: object) -> None:
@@ -170,7 +170,7 @@ class Live:
         self.close()
 
     def _each(self, what: Callable[..., object], *arguments: object) -> None:
-        """Call a method of the connection to every browser."""
+        """Call a method of `_Socket` for the connection to each browser."""
         self._call(lambda: [what(client, *arguments) for client in list(self._clients)])
 
     def _call(self, what: Callable[[], object]) -> None:
@@ -204,7 +204,7 @@ def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
 
 
 class _Guarded(RequestHandler):
-    """Handler that refuses requests from other sites: the host must be this machine."""
+    """Handler that refuses each request whose Host header does not name this machine."""
 
     def initialize(self, live: Live) -> None:
         self._live = live
@@ -224,7 +224,10 @@ class _Page(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """Connection to one browser. The next state is sent when the previous has arrived."""
+    """Connection to one browser.
+
+    A state is sent only after the previous state has been written to the connection.
+    """
 
     _busy = False
     _behind = False

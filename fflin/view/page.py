@@ -39,14 +39,14 @@ with warnings.catch_warnings():
 
 Lowered = dict[str, Any]
 
-# Wheels in the same frame would overlap. Each is moved along its axis by this distance, relative to
-# the robot's size.
+# Wheels in the same frame would overlap. Therefore each of these wheels is moved along its axis by
+# this distance, relative to the robot's size.
 _APART = 0.1
 
 # The axis of a cylinder is y in three.js, and z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
-# {type of an array: its extension type of msgpack-lite, and the typed array that the page decodes}.
+# {type of an array: (extension type of msgpack-lite, name of the typed array in JavaScript)}.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
 # Placeholder for a mesh that has already been sent to the page.
@@ -59,7 +59,7 @@ _SCRIPTS = (
 
 
 def packed(array: Array) -> str:
-    """Encode an array in single precision for the function `floats` of the page."""
+    """Encode an array in single precision; the JavaScript function `floats` decodes it."""
     return _base64(np.ascontiguousarray(array, dtype="<f4").tobytes())
 
 
@@ -91,8 +91,8 @@ def _fixed() -> dict[str, str]:
 def body_poses(robot: Robot, q: Array) -> Array:
     """Return the poses (.., njoints - 1, 7) of all bodies at q (.., nq).
 
-    A body has the pose of its joint frame. The first mode of a flexible appendage has the pose of
-    the appendage's bent frame instead.
+    The pose of a body is the pose of its joint's frame. The body of the first mode of a flexible
+    appendage is an exception: its pose is the pose of the appendage's frame after bending.
     """
     data, found = robot.model.createData(), []
     for row in q.reshape(-1, robot.nq):
@@ -107,8 +107,8 @@ def body_poses(robot: Robot, q: Array) -> Array:
 class Drawing:
     """Drawing of a robot below a node of a page's scene, with a child node for each body.
 
-    The page receives the links of a robot that is drawn as `real` or `held`, and notes about
-    missing drawings.
+    The constructor adds notes about missing drawings to `page.notes`. If `look` is "real" or
+    "held", it also adds the links of the robot to `page.links`.
     """
 
     def __init__(
@@ -134,8 +134,8 @@ class Drawing:
                     about["mesh"] = identity
                     page.sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
-                # A three.js mesh. The page replaces the placeholders by its own material and
-                # meshes.
+                # A three.js mesh. The page replaces the material, which is a placeholder. If the
+                # geometry is the placeholder _ELSEWHERE, the page replaces it by an earlier mesh.
                 content = {
                     "metadata": {"version": 4.5, "type": "Object"},
                     "geometries": [shown],
@@ -164,7 +164,7 @@ class Drawing:
             self._send("set_transform", self._visualizer[path], matrix=matrix)
 
     def points(self, poses: Array) -> Array:
-        """Return the corners (M, 3) of all bounding boxes in the world."""
+        """Return the corners (M, 3), in the world, of the bounding boxes of all bodies."""
         found = []
         for joint, corners in self.corners.items():
             placement = pin.XYZQUATToSE3(poses[joint - ROOT])
@@ -192,7 +192,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
     known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
     mass = known.mass if known else 0.0
-    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # its inertia is drawn
+    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # an inertia box
         mass = robot.model.inertias[shape.joint].mass
     return [mass, *pin.SE3ToXYZQUAT(shape.at).round(6).tolist()]
 
@@ -203,7 +203,11 @@ def typed(array: Array | Indices, kind: str = "<f4") -> object:
 
 
 def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]:
-    """Return the geometry, matrix, colour, and opposite corners of the box of each piece."""
+    """Return the geometry, matrix, colour and bounding box of each three.js mesh of a shape.
+
+    A bounding box is given by two opposite corners (2, 3), before the transform by the matrix
+    (4, 4). A capsule has three meshes: a cylinder and two spheres.
+    """
     unit = np.eye(4)
     if shape.kind == "mesh":
         assert shape.mesh is not None
@@ -255,7 +259,10 @@ def _bounds(points: Array) -> Array:
 
 
 def _box_corners(matrix: Array, box: Array) -> Array:
-    """Return the corners (8, 3) of a box, given by two corners (2, 3), after a transform (4, 4)."""
+    """Return the corners (8, 3) of a box after a transform (4, 4).
+
+    `box` (2, 3) contains the least and the largest coordinates before the transform.
+    """
     choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
     corners = np.take_along_axis(box, choice, axis=0)
     return corners @ matrix[:3, :3].T + matrix[:3, 3]
@@ -277,7 +284,7 @@ class Recorder:
         self.record(command.lower())
 
     def record(self, lowered: Lowered) -> None:
-        """Record and forward a command in the form in which meshcat sends it."""
+        """Record and forward a command that is already in the form of a dictionary."""
         kind, path = lowered["type"], lowered.get("path", "")
         # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
@@ -296,7 +303,8 @@ class Recorder:
     def commands(self) -> Iterator[bytes]:
         """Yield the messages with which meshcat's page builds the recorded scene."""
         for node in list(self._nodes.values()):
-            # Setting an object resets its properties, so it is sent before them.
+            # "set_object" resets the properties of a node, so this command is sent before the
+            # commands that set these properties.
             for key in sorted(node, key=lambda key: key != "set_object "):
                 yield umsgpack.packb(node[key])
         if self._animation:
@@ -351,7 +359,10 @@ class Page:
         self.floor = np.array([*self.centre[:2], low[2]])
 
     def html(self, mode: str, points: Array, **entries: object) -> str:
-        """Return the page with additional entries; its camera shows all points (M, 3)."""
+        """Return the HTML of the page, with a camera that shows all points (M, 3).
+
+        `entries` are added to the data that the scripts of the page read.
+        """
         robot, nodes, orbit = self.robot, self.nodes, dict[str, object]()
         if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
@@ -373,11 +384,11 @@ class Page:
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
             apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
-            # If the speed of the wheel is a state, the wheel rotates with the node of its joint.
+            # If the speed of a wheel is a state, the drawn wheel rotates with its joint's node.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
-        # A live page receives its commands from the server. Other pages contain them and open no
-        # connection.
+        # A live page receives the meshcat commands from the server. Other pages contain these
+        # commands and open no connection.
         live, digits = mode == "live", max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **orbit,

@@ -37,12 +37,12 @@ from fflin.view.shapes import carriers_of
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-# ARROW is the length of the largest force's arrow. If the motion extends over more than _FAR, the
-# camera follows the base by default. Both are relative to the robot's size.
+# ARROW is the length of the arrow for the largest force. If the motion extends over more than _FAR,
+# the camera follows the base by default. Both lengths are relative to the robot's size.
 ARROW, _FAR = 0.62, 20.0
 
-# Largest step of the integration of a payload's flight before its capture: in time [s], and in the
-# phase [rad] of its fastest oscillation.
+# The flight of a payload before its capture is integrated in steps. _STEP is the longest step [s].
+# _SWING is the largest phase [rad] of the payload's fastest oscillation in a step.
 _STEP, _SWING = 0.05, 0.3
 
 # Largest number of frames. More frames would enlarge the file without a visible effect.
@@ -51,7 +51,8 @@ _MOST_FRAMES = 3000
 # Values below this, in SI units, count as rounding errors.
 _NOTHING = 1e-14
 
-# Lines that are smaller than this fraction of the largest line in their plot are not drawn.
+# A curve is not drawn if its largest magnitude is less than this fraction of the largest magnitude
+# of all curves in its plot.
 _UNSEEN = 1e-6
 
 _NONE = np.zeros(0)
@@ -65,7 +66,7 @@ def motion_page(
     frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:  # none, one, or one for each frame
+    if target is None:  # `states` is empty, or has one target, or one for each frame
         states = motion.target.reshape(-1, state.nx)
         states = states[shown] if len(states) > 1 else states
         goal = state.points(states)[1]
@@ -127,7 +128,7 @@ def motion_page(
 
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
-    """Return points (M, 3) that the camera must show: corners of the bodies, tips of the forces."""
+    """Return points (M, 3) that the camera must show: corners of bodies, tips of force arrows."""
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
@@ -139,7 +140,11 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 
 
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
-    """Return trails, arrows and plumes of a page; a moving target `goals` also has trails."""
+    """Return the data of the trails, force arrows and thruster plumes of a page.
+
+    `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and its
+    trails are included.
+    """
     trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
         trails, followed = {"base": film.poses[:, 0, :3]}, {"base": goals[:, 0, :3]}
@@ -189,7 +194,10 @@ def frame_indices(t: Array, fps: float, speed: float) -> Array:
 
 
 def play_back(state: StateMap, q: Array, u: Array) -> Playback:
-    """Compute an animation from rows of a motion, whose wrenches are in the state's frame."""
+    """Return the animation of configurations q (N, nq) and inputs u (N, nu).
+
+    The wrenches on the base are converted from the frame of `state` to world axes.
+    """
     robot, data, groups = state.robot, state.robot.create_data(), Actuation(state).groups
     poses = body_poses(robot, q)
     com = np.array([pin.centerOfMass(robot.model, data, row).copy() for row in q])
@@ -208,7 +216,7 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
 
 
 def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
-    """Yield each capture with the poses (N, njoints - 1, 7) of its payload at the rows `shown`."""
+    """Yield each capture, and poses (N, njoints - 1, 7) of its payload at the samples `shown`."""
     parts = motion._phases
     first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
     for k, caught in enumerate(parts):
@@ -223,7 +231,10 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
 
 
 def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
-    """Return the poses of a payload at times [s] before its capture, in undamped, free flight."""
+    """Return the poses of a payload at times t (N,) [s] before its capture, which is at t = 0.
+
+    The free flight is integrated backwards from the capture, without damping.
+    """
     payload = caught.payload.replace(damping=0.0)
     state = StateMap(payload, frame=frame)
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
@@ -241,7 +252,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
 
 
 def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
-    """Return the poses of a captured payload, for rows of q (N, nq) of the combined robot."""
+    """Return the poses of a captured payload at configurations (N, nq) of the combined robot."""
     model, data = robot.model, robot.model.createData()
     places = carriers_of(robot, caught.prefix, caught.payload)
     poses = []
@@ -273,7 +284,11 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
-    """Return readouts and plots of the rows `shown`, with errors from the target (k, nq)."""
+    """Return the readouts and plots of a motion at the samples `shown`.
+
+    Errors are relative to the target (k, nq). If k = 0, changes from the first configuration are
+    shown.
+    """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
@@ -293,8 +308,8 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             lines.append(each._replace(values=each.values[shown], reference=reference))
         least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
         seen = [each for each in lines if _size(each) >= least]
-        # States of the base are not plotted, because their errors are. Rates are plotted only near
-        # a limit.
+        # States of the base are not plotted here, because the errors of attitude and position are
+        # plotted above. Rates are plotted only if one of them comes near a limit.
         of_base = whole[0].group in STATES and whole[0].group not in JOINTS
         if any(each.near or not title.endswith("rates") for each in seen) and not of_base:
             plots.append(_plot(title, seen))
@@ -316,12 +331,12 @@ def _size(curve: Curve) -> float:
 
 
 def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
-    """Return the plot of some curves, with the limits that they come close to."""
+    """Return the data of a plot: its curves, and the limits that each curve comes near."""
     group = lines[0].group
     return {
         "title": title,
         "unit": lines[0].unit,
-        # All plots of a family show a name in the same colour.
+        # In all plots of a family, curves with the same label have the same colour.
         "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
         "lines": [
             {
@@ -338,7 +353,7 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
 def mode_page(
     robot: Robot, found: Modes, scene: str, tool: str | None
 ) -> tuple[str, Collection[str]]:
-    """Return the page of a robot's modes, and notes about parts that are not drawn."""
+    """Return the page of a robot's modes, and notes about visual elements that are not drawn."""
     lin = found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
@@ -397,9 +412,10 @@ def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
 
 
 def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
-    """Return name, unit, amplitude and phase [deg] of the positions with the largest amplitude.
+    """Return the name, unit, amplitude and phase [deg] of up to eight positions of a mode.
 
-    The largest amplitude is 1.
+    They are the positions with the largest amplitudes. The largest amplitude is 1, and amplitudes
+    of 0.01 or less are omitted.
     """
     sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
     order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()

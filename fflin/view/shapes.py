@@ -35,17 +35,17 @@ _DENSITY = 1000.0  # [kg/m^3] density of a ball that represents a mass
 
 @dataclass(frozen=True)
 class Shape:
-    """Visible piece of a robot, rigidly fixed to the body that a joint moves."""
+    """Visual geometry that is rigidly fixed to a body of a robot."""
 
     joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
-    size: tuple[float, ...]  # side lengths; radius; radius and length [m]; or a mesh's scale
+    size: tuple[float, ...]  # [m] sides, radius, or radius and length; scale of a mesh
     placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
     color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
-    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # of the link in the joint's frame
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's placement on the joint
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -69,7 +69,11 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
 
 
 def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
-    """Return where a robot carries the base and joints of a payload that is attached to it."""
+    """Return where the base and the joints of an attached payload are on the robot.
+
+    Each entry is the robot's joint that carries a frame of the payload, and the placement of the
+    frame on this joint.
+    """
     names = [f"{prefix}.{name}" for name in list(payload.model.names)[ROOT + 1 :]]
     return [find_frame(robot.model, prefix), *(find_joint(robot.model, name) for name in names)]
 
@@ -181,19 +185,21 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
 
 
 class Bending(NamedTuple):
-    """Linear map from an appendage's modal amplitudes to a rotation about its frame.
+    """Linear map from an appendage's modal amplitudes to a rotation or displacement for drawing.
 
-    The links of the appendage are drawn with this rotation, which is the best fit to the
-    participation of the modes. If no mode has a rotational participation, the links are translated
-    instead.
+    The links of the appendage are drawn as a rigid body, rotated about the origin of the
+    appendage's frame. The rotation theta is the least-squares solution of L^T theta = eta, with the
+    rotational participation L (3, k) and the modal amplitudes eta (k,). If L is zero, the links are
+    displaced instead. The displacement follows from the same equation, in which L is replaced by
+    the translational participation.
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
-    carrier: int  # Pinocchio joint
+    carrier: int  # Pinocchio joint that carries the appendage
     frame: pin.SE3  # placement on the carrier
     modes: list[int]  # indices in q
     twist: Array  # (6, k) per unit of q: translation before rotation
-    center: Array  # (3,) position in the frame of a ball that represents the links
+    center: Array  # (3,) centre, in `frame`, of a ball that represents the links
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement, in the world, of the appendage's frame after bending."""
@@ -273,8 +279,8 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 # triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles of a mesh. The grid is made coarser until the mesh has at most this
-# number, or the cells become too large.
+# Largest number of triangles of a mesh file. The grid is made coarser until the file has at most
+# this number, or until the cells are larger than 2 % of the largest extent of the meshes.
 _LARGEST = 20_000
 
 
@@ -331,7 +337,7 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
         found = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
             color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
-            if color is not None:  # None stands for a texture, or nothing
+            if color is not None:  # None if the file gives a texture or no colour
                 r, g, b, a = (float(x) / 255.0 for x in color)
                 color = r, g, b, a or 1.0
             found.append((mesh.vertices, mesh.faces, color))

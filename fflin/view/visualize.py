@@ -249,9 +249,10 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
 def check_playback(
     fps: float, speed: float | None, times: Sequence[float] | None, start: float, end: float
 ) -> tuple[float, float, list[float] | None]:
-    """Check and return fps, speed and the times [s] of pictures of a motion from start to end [s].
+    """Check the frame rate, speed and picture times [s] of a motion, and return them.
 
-    For speed=None, choose a speed for the duration of the motion.
+    `start` and `end` [s] are the first and the last time of the motion. If `speed` is None, choose
+    a speed at which the animation takes at most _LONGEST seconds.
     """
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
@@ -267,7 +268,10 @@ def check_playback(
 
 
 def _robot_of(robot: Robot, motion: Motion) -> Robot:
-    """Return the robot of a motion, because a run of a campaign may have a perturbed robot."""
+    """Return the robot that a motion was simulated with.
+
+    In a run of a campaign, it may be a perturbed robot instead of the given nominal robot.
+    """
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
@@ -297,8 +301,8 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # A motion that settles is fastest at the beginning, so more pictures are early. A tracking
-        # motion never settles, so its pictures are evenly spaced.
+        # A motion that settles is fastest at the beginning, so its pictures are closer together
+        # there. A tracking motion never settles, so its pictures are evenly spaced.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
     contents = {}
