@@ -39,12 +39,12 @@ _TITLES = {
 }
 JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
-# A target is at rest if each of its positions changes by less than this [SI units] from row to row.
+# A target rests if, from row to row, no position of the target changes by more than this [SI units].
 _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target rests.
+    """Return the time [s] at which a moving target comes to rest.
 
     Return None if the target never moves or never comes to rest, or if the motion has phases.
     """
@@ -98,7 +98,7 @@ def plot_motion(
     drawn = charts(motion, show)
     states = [title for title, found in drawn.items() if found[0].group in STATES]
     others = len(drawn) - len(states) + 1  # including the drift
-    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
+    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of a chart of states and of the errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
     heights += [3.0] * math.ceil(others / _ACROSS)
@@ -166,8 +166,9 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """Return the label and the curves {state: curve} of the panels below the charts of states.
 
-    If the motion follows a reference, the curves are the errors from the reference. Otherwise, they
-    are the differences from the linear prediction. Without a prediction, there are no curves.
+    If the motion follows a reference, the curves are the errors from the reference. Otherwise, the
+    curves are the differences from the linear prediction. Without a reference and a prediction,
+    there are no curves.
     """
     names, units, what = motion.state_names, motion.state_units, "error"
     if motion.tracked and (e := motion.error) is not None:
@@ -191,7 +192,7 @@ def _draw(
 ) -> None:
     """Draw curves and their limits, with references in pale colours and predictions dashed."""
     group, unit = found[0].group, found[0].unit
-    # Attitude curves have gaps at 180 degrees, where the quaternion changes its sign.
+    # At 180 degrees, the quaternion changes its sign, so attitude curves jump. Leave a gap there.
     for field in ("values", "linear", "reference") if group == "q_b" else ():
         if getattr(found[0], field) is not None:
             rows = np.array([getattr(each, field) for each in found])

@@ -1,8 +1,10 @@
 """The Python engine: accelerations, conserved quantities, and the simulation loop.
 
-Without external forces, the momentum about a fixed point is constant, and the centre of mass is at
-r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m. In orbit, the momentum is not
-constant. The Jacobi integral (14.3) is constant if inputs, disturbance and dampers do no work.
+Without external forces, the momentum about a fixed point is constant. The centre of mass is then at
+r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m.
+
+In orbit, the momentum is not constant. The Jacobi integral (14.3) is constant if inputs,
+disturbance and dampers do no work.
 """
 
 from __future__ import annotations
@@ -33,11 +35,11 @@ if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
 
 # Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force on the
-# base and torque on the base, both in base axes, then the forces or torques of the joints.
+# base, torque on the base, forces or torques of the joints. The first two are in base axes.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Above this velocity [SI units], the motion has diverged. A disturbance that is not finite then
-# raises no error.
+# Above this velocity [SI units], the motion has diverged. After this point, a disturbance that is
+# not finite raises no error.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -67,8 +69,8 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         nu, groups = len(self.actuation.names), self.actuation.groups
-        # Indices in u of the first component of the base torque and of the base force, if these are
-        # inputs.
+        # Index in u of the first component of the base torque, and of the base force. A vector that
+        # is not an input is left out.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
@@ -78,7 +80,7 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         self._columns = state.lift(self.actuation.fixed)
-        # True if, without a disturbance, the inputs are the only forces, and B_u is constant.
+        # True if B_u is constant, and the inputs are the only forces apart from a disturbance.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
@@ -158,14 +160,15 @@ class Conserved:
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
-        # The centre of mass at time t is the first column plus t times the second. The first column
-        # is its initial position plus the displacement by the external impulse so far. The second
-        # column is its initial velocity.
+        # The centre of mass at time t is the first column of `_line` plus t times the second. The
+        # first column is the initial centre of mass plus the displacement by the external impulse
+        # so far. The second column is the initial velocity of the centre of mass.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # Rows: the impulse so far (6,), the displacement of the centre of mass that it causes (the
-        # first three entries), and the wrench (6,) at each stage of a step. If no external forces
-        # act, all rows are exactly zero.
+        # The first row of `_stack` is the external impulse so far (6,). The second row contains the
+        # displacement of the centre of mass by this impulse in its first three entries. The other
+        # rows are the wrenches (6,) at the stages of a step. If no external forces act, all rows
+        # are exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
@@ -190,7 +193,7 @@ class Conserved:
         return total
 
     def advance(self) -> None:
-        """Advance momentum and centre of mass by one step, whose stages have the `wrenches`."""
+        """Advance momentum and centre of mass by a step with the current `wrenches`."""
         self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
         self._line[:, 0] = self._center + displacement[:3]
@@ -205,10 +208,10 @@ class Conserved:
 
         After the correction, centre of mass and momentum are equal to their predictions at time t.
         """
-        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m), where c_b is the centre of
-        # mass and H_b the momentum, both relative to the base and in base axes. The equation for
-        # nu_b is solved for the correction of nu_b, which is small, and so are its rounding errors.
-        # M is in base axes, and therefore does not depend on the position of the base.
+        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Here c_b is the centre of
+        # mass and H_b the momentum, both relative to the base and in base axes. The second equation
+        # is solved for the correction of nu_b. This correction is small, and therefore has small
+        # rounding errors. M is in base axes, and therefore does not depend on the base position.
         momentum = self.momentum
         _crba(self._model, self._data, q)
         if self._stored:
@@ -231,11 +234,17 @@ class Conserved:
     def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
 
-        They are, in this order: energy (N,), momentum about the centre of mass (N, 6), centre of
-        mass (N, 3), momentum about the fixed point (N, 6), and the upper bounds (2,) of linear and
-        angular momentum (11.5). In orbit, the energy is the Jacobi integral. This integral and five
-        zeros replace the momentum about the fixed point. The size of the integral's largest terms
-        and a zero replace the bounds.
+        The five arrays are, in this order,
+
+        - the energy (N,);
+        - the momentum about the centre of mass (N, 6);
+        - the centre of mass (N, 3);
+        - the momentum about the fixed point (N, 6);
+        - the upper bounds (2,) of linear and angular momentum (11.5).
+
+        In orbit, the energy is the Jacobi integral. The momentum about the fixed point is replaced
+        by the Jacobi integral and five zeros. The bounds are replaced by the size of the largest
+        terms of the Jacobi integral and a zero.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()

@@ -29,8 +29,8 @@ from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptio
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
 
 # Linear model that predicts a motion, and a function that returns the command (nu,) for a deviation
-# from the operating point. The deviation consists of the states of the robot. If the controller is
-# in continuous time, its states follow.
+# from the operating point. The deviation contains the states of the robot. If the controller is in
+# continuous time and has states, the deviation also contains these states, at the end.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
 # After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The

@@ -29,7 +29,7 @@ _TURN = 2.0 * math.pi  # [rad]
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter, such as "inertia.xx" of "arm", and its effect: how the robot changes per unit."""
+    """Parameter, such as "inertia.xx" of "arm", and the change of the robot per unit."""
 
     of: str
     part: str
@@ -42,8 +42,8 @@ class Parameter:
     joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). The wrench is the
-    # derivative, with respect to this parameter, of the wrench that an input of 1 applies.
+    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). If the parameter
+    # increases by one unit, the wrench that a unit input exerts changes by this wrench.
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -53,7 +53,7 @@ class Parameter:
 
 
 class Parameters(dict[str, Parameter]):
-    """Parameters of a robot by name; a body of one link can also be named by its joint."""
+    """Parameters of a robot by name; a body of one link has the names of its link and joint."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
@@ -65,7 +65,7 @@ class Parameters(dict[str, Parameter]):
     def find(self, key: str) -> list[str]:
         """Return the names that match a name or pattern.
 
-        A pattern matches a body of several links only if it matches no link.
+        Parameters of a body of several links are returned only if the pattern matches no link.
         """
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
@@ -150,7 +150,7 @@ class Parameters(dict[str, Parameter]):
             mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
             density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
             # An unchanged inertia is always accepted, for example zero for a point mass. If the
-            # nominal inertia is not physically realisable, a change must not make it worse.
+            # nominal inertia is not physically realisable, the changed one must not be worse.
             was, least = (
                 float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0])
                 / (np.trace(J) or 1.0)

@@ -1,4 +1,4 @@
-"""Live viewer: a page in a browser of this machine, served by a thread of this process."""
+"""Live viewer: a page in a browser on this machine, served by a thread of this process."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ class Live:
 
 
 def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
-    """Return {joint: range of its slider [rad|m|kg^0.5 m]} for all joints except wheels."""
+    """Return {joint: range of the slider [rad|m|kg^0.5 m]} for all joints except wheels."""
     found = {}
     for joint in robot.joints:
         most = 1.0 if joint.prismatic else np.pi

@@ -71,8 +71,8 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
 def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
     """Return where the base and the joints of an attached payload are on the robot.
 
-    Each entry is the robot's joint that carries a frame of the payload, and the placement of the
-    frame on this joint.
+    Each entry belongs to the base or to a joint of the payload. It contains the joint of the robot
+    that carries this frame of the payload, and the placement of the frame on that joint.
     """
     names = [f"{prefix}.{name}" for name in list(payload.model.names)[ROOT + 1 :]]
     return [find_frame(robot.model, prefix), *(find_joint(robot.model, name) for name in names)]
@@ -279,8 +279,9 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 # triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles of a mesh file. The grid is made coarser until the file has at most
-# this number, or until the cells are larger than 2 % of the largest extent of the meshes.
+# Largest number of triangles that are drawn for a mesh file. Vertices in the same cell of a grid
+# are merged. The grid is made coarser until at most this number of triangles remain, or until the
+# cells are larger than 2 % of the largest extent of the file's meshes.
 _LARGEST = 20_000
 
 
@@ -294,7 +295,10 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length; raise ValueError if it cannot be drawn."""
+    """Read a mesh file; raise ValueError if it cannot be drawn.
+
+    The vertices are in the file's unit of length. For a COLLADA file, they are in m.
+    """
     try:
         found = os.stat(path)
     except OSError as error:
@@ -367,7 +371,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # After the merge, several triangles may be equal; keep only one of them.
+    # After the merge, several triangles may have the same corners; keep only one of them.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)
