@@ -39,7 +39,8 @@ _TITLES = {
 }
 JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
-# A target rests if, from row to row, no position of the target changes by more than this [SI units].
+# A target is at rest if none of its positions changes by more than this [SI units] from one row to
+# the next.
 _STILL = 1e-12
 
 
