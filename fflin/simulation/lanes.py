@@ -38,7 +38,7 @@ LONG = 20_000
 SLOTS = 128  # samples whose noise is stored at a time
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
-# {name of an array of the loop: its values (N, size) in N runs}; see `Dispersions.in_lanes`.
+# {name of an array of the loop: values (N, size) in each of N runs}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
@@ -118,10 +118,10 @@ class Statistics:
     def add(self, first: int, rows: Array) -> None:
         """Add rows (count, width, LANES) of q, nu, u, momentum and centre of mass.
 
-        The rows belong to successive steps that are multiples of `every`. The first of these steps
-        is `first`, or the next multiple after `first`. When a run ends, this method is called with
-        a single row, at the step `first`, for all lanes. For runs that continue, the next call may
-        contain this row again.
+        The rows are recorded at steps that are multiples of `every`. The first row is at the first
+        of these steps that is not before the step `first`. When a run ends, this method is called
+        with a single row, at the step `first`, for all lanes. For runs that continue, the next call
+        may contain this row again.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
@@ -238,7 +238,7 @@ class LaneLoop:
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            # If the end of a run interrupted a slice, its noise has been drawn already.
+            # If the end of a run interrupted this slice, the noise of the slice is already drawn.
             if not self._noisy or drawn == last:
                 return
             drawn = last
@@ -359,7 +359,7 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return the law of an uncontrolled robot; the law computes states and errors, no commands."""
+    """Return the law of an uncontrolled robot; the law computes states and errors only."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))

@@ -146,8 +146,8 @@ class Plan:
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
-        # motion, it is within half a turn of the joint's angle in the state `near` (nx,). If `near`
-        # is None, it is within half a turn of 0.
+        # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
+        # If `near` is None, this angle is within half a turn of 0.
         self.near = self.target
         if options.x0 is not None:
             self.near = np.asarray(options.x0, dtype=float)
@@ -328,10 +328,10 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 
 
 def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
-    """Return the sample time [s] of a policy and 0, or None and the rate [1/s] of the closed loop.
+    """Return the sample time [s] or None, and the rate [1/s] of the fastest pole or 0.
 
-    A continuous policy has no sample time. In this case, the rate is the absolute value of the
-    fastest pole of the closed loop, or 0 if this pole is not known.
+    For a sampled policy, return its sample time and 0. For a continuous policy, return None and the
+    absolute value of the fastest pole of the closed loop, or None and 0 if this pole is not known.
     """
     follows, by = tracking_of(policy), decider(policy)
     if sample is not None:

@@ -168,8 +168,8 @@ def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """Return the label and the curves {state: curve} of the panels below the charts of states.
 
     If the motion follows a reference, the curves are the errors from the reference. Otherwise, the
-    curves are the differences from the linear prediction. Without a reference and a prediction,
-    there are no curves.
+    curves are the differences from the linear prediction. If there is neither a
+    reference nor a prediction, there are no curves.
     """
     names, units, what = motion.state_names, motion.state_units, "error"
     if motion.tracked and (e := motion.error) is not None:

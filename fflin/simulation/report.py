@@ -25,8 +25,8 @@ SETTLED = 0.02
 # _NOTHING appears as a dot in tables. Both limits exceed the rounding errors of a robot at rest.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# An error counts as settled only if it is small throughout the end of a run. DWELL is the length of
-# this end, as a fraction of the rows of the run.
+# An error counts as settled only if it stays small during the last part of a run. DWELL is the
+# length of this part, as a fraction of all rows.
 DWELL = 0.05
 
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be

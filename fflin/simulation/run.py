@@ -165,10 +165,10 @@ class Conserved:
         # so far. The second column is the initial velocity of the centre of mass.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # The first row of `_stack` is the external impulse so far (6,). The second row contains the
-        # displacement of the centre of mass by this impulse in its first three entries. The other
-        # rows are the wrenches (6,) at the stages of a step. If no external forces act, all rows
-        # are exactly zero.
+        # The first row of `_stack` is the external impulse so far (6,). The first three entries of
+        # the second row are the displacement of the centre of mass by this impulse. The other rows
+        # are the wrenches (6,) at the stages of a step. If no external forces act, all rows are
+        # exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
@@ -307,7 +307,7 @@ class Recording(NamedTuple):
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
-    """Simulate a plan in Python; the progress bar of a long run shows `hint`."""
+    """Simulate a plan in Python; the progress bar of a long run shows the text `hint`."""
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])

@@ -220,7 +220,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
-    """Build the motion from the recorded rows of a run, with a linear prediction by `foresees`."""
+    """Build the motion from the recorded rows of a run; `foresees` computes the prediction."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -341,7 +341,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 
     def stepped(e: Array) -> Array:
-        """Return e after one step of the classical Runge-Kutta method."""
+        """Return the deviation e after one step of the classical Runge-Kutta method."""
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate

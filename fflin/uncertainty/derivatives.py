@@ -35,9 +35,9 @@ WEIGH = (CenterOfMass, Momentum)
 
 # Relative change of M in one step of the finite differences.
 _STEP = 2e-3
-# If a step changes A by less than this fraction of A, rounding errors dominate the finite
-# differences. In this case, the error of dA times the step is divided by this fraction of A. The
-# same applies to B.
+# Errors of dA are divided by the largest entry of dA. But if a step changes A by less than this
+# fraction of A, rounding errors dominate the finite differences. In this case, errors of dA are
+# divided by the derivative that would change A by this fraction in a step. The same applies to B.
 _LEAST = 1e-6
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -126,8 +126,8 @@ class ModelDerivatives:
 
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # `weighed` returns the rows of these outputs, multiplied by the robot's mass. The result is
-        # a quadratic function of the parameter, because `weighed` changes the accelerations
+        # `weighed` returns [C, D, y0] for these outputs, multiplied by the robot's mass. The result
+        # is a quadratic function of the parameter, because `weighed` changes the accelerations
         # linearly. So three values at any step size give the exact derivative, see (12.2a).
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))

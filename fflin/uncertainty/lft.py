@@ -9,9 +9,10 @@ force F:
 
     s = T X a,   f = D s,   F = X^T T^T f
 
-X is the Jacobian of the link's centre of mass, in the axes of the link's inertia. D = blkdiag(m E,
-I) contains the mass m and the inertia I. T shifts an uncertain centre of mass. If the centre of
-mass is known, T is the identity E. Each parameter of a link multiplies :math:`r_k` signals:
+X is the Jacobian of the link's centre of mass, in the axes of the link's inertia. The matrix
+D = blkdiag(m E, I) contains the mass m and the inertia I. T shifts an uncertain centre of mass. If
+the centre of mass is known, T is the identity E. Each parameter of a link multiplies :math:`r_k`
+signals:
 
 - 3 for a mass,
 - 6 for a density,
@@ -297,7 +298,7 @@ class _Form:
         self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
-        # `z` reserves _MOST rows for each parameter. `used` (k,) counts the rows in use.
+        # For each parameter, `z` reserves _MOST rows, and `used` counts the rows in use.
         self.used = np.zeros(len(ranges), dtype=np.intp)
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
         # Inertial forces plus spring and damper forces minus input forces. By the equation of

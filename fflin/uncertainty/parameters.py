@@ -42,8 +42,8 @@ class Parameter:
     joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). If the parameter
-    # increases by one unit, the wrench that a unit input exerts changes by this wrench.
+    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). To first order, this
+    # is the change, per unit of the parameter, of the wrench that a unit input exerts.
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -53,7 +53,7 @@ class Parameter:
 
 
 class Parameters(dict[str, Parameter]):
-    """Parameters of a robot by name; a body of one link has the names of its link and joint."""
+    """Parameters of a robot by name; a body of one link can be named by its link or joint."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
@@ -88,7 +88,7 @@ class Parameters(dict[str, Parameter]):
         return [name for name in found if self[name].of not in self._sums] or found
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} is not physically realisable, or an empty string."""
+        """Return why the robot with {parameter: value} is not realisable, or an empty text."""
         try:
             self._bodies(values)
             if self._robot.wheels or self._robot.modes:  # a link may be too light to carry them

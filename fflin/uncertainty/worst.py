@@ -274,9 +274,9 @@ def _safe(loops: Loops) -> float:
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
-# parameters, mu can be a discontinuous function of the frequency. So a bound that
-# holds at two frequencies may not hold between them. The bound for a fixed scaling, however, is a
-# continuous function of the frequency. Therefore one scaling is used for a whole interval.
+# parameters, mu can be a discontinuous function of the frequency. So a bound that holds at two
+# frequencies may not hold between them. The bound for a fixed scaling, however, is a continuous
+# function of the frequency. Therefore one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:

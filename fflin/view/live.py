@@ -159,7 +159,7 @@ class Live:
             self.close()
 
     def close(self) -> None:
-        """Close the viewer; the page then reports the lost connection."""
+        """Close the viewer; the page in the browser reports the lost connection."""
         self._call(self._stop.set)
         self._thread.join(5.0)
 

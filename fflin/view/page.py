@@ -387,8 +387,8 @@ class Page:
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
             apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
-            # If the speed of a wheel is a state, the drawn wheel rotates with the node of
-            # the wheel's joint.
+            # If the speed of a wheel is a state, the drawn wheel rotates with the node of the
+            # wheel's joint.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         # A live page receives the meshcat commands from the server. Other pages contain these

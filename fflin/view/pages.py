@@ -142,8 +142,8 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the data of the trails, force arrows and thruster plumes of a page.
 
-    `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and its
-    trails are included.
+    `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and the
+    trails of the target are included.
     """
     trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
@@ -243,7 +243,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
-    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] above all frequencies
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of frequencies
     for time in t[::-1].tolist():
         steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
