@@ -35,7 +35,7 @@ _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # the loop is already stored.
 LONG = 20_000
 
-SLOTS = 128  # samples whose noise is stored at a time
+SLOTS = 128  # number of samples for which noise is stored at once
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
 # {name of an array of the loop: values (N, size) in each of N runs}; see `Dispersions.in_lanes`.
@@ -45,9 +45,9 @@ Runs: TypeAlias = Mapping[str, Array]
 def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     """Return the name of the engine for a plan: the requested engine, or the default engine.
 
-    If the compiled loop supports the plan, it is the default engine for many runs. For a single
-    run, it is the default only if the run is long and the machine code of the loop has been stored
-    by an earlier run.
+    The default engine for many runs is the compiled loop, if it supports the plan. For a single
+    run, two further conditions must be true: the run is long, and the machine code of the loop has
+    been stored by an earlier run.
     """
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
@@ -109,7 +109,7 @@ class Statistics:
     span = 4096  # steps between calls of `over`; Ctrl-C takes effect after at most this many
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of the runs that must end early, from their q and v."""
+        """Return a mask (LANES,) of the runs that must end early, judged by q and v."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
@@ -377,8 +377,8 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy.
 
     An `Allocation` contains a policy for another robot, `Allocation.design`. In this case, the law
-    computes commands for the inputs of that robot. It allocates these commands to the inputs of the
-    simulated robot.
+    first computes commands for the inputs of that robot. It then allocates these commands to the
+    inputs of the simulated robot.
     """
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):

@@ -59,7 +59,8 @@ _NEAR = 1.0 / 3.0
 class Curve(NamedTuple):
     """Values (N,) and limits of a state, input or wheel momentum.
 
-    `linear` (N,) is the linear prediction and `reference` (N,) the followed reference, if any.
+    If they exist, `linear` (N,) is the linear prediction, and `reference` (N,) is the reference
+    that the robot follows.
     """
 
     key: str  # GROUP.NAME
@@ -83,7 +84,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits for which the largest value is at least _NEAR times the limit."""
+        """Limits that the curve comes near: some value is at least _NEAR times the limit."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 

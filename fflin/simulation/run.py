@@ -69,8 +69,7 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         nu, groups = len(self.actuation.names), self.actuation.groups
-        # Index in u of the first component of the base torque, and of the base force. A vector that
-        # is not an input is left out.
+        # Indices in u at which the base torque and the base force begin, if they are inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
@@ -150,7 +149,7 @@ class Conserved:
         self._robot, self._model, self.mass = robot, robot.model, robot.mass
         self._field, self._stored = plan.plant.field, robot.stored_momentum
         self._data = data = robot.create_data()
-        self._M = data.M[:6]  # CRBA writes into it
+        self._M = data.M[:6]  # CRBA writes into this array
         self._M_bb = self._M[:, :6]
         self._start = np.concatenate((start, np.zeros(4)))
         self._x, self._y, self._z = start.tolist()  # numbers are faster than arrays

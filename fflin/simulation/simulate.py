@@ -352,7 +352,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     cuts = not sample and plan.limits.cuts
     held = lin.discretize(dt) if sample else lin
     A, B, f0 = held.A, held.B, held.f0
-    if not (sample or cuts):  # a step is then e -> A e + f0
+    if not (sample or cuts):  # in this case, a step is e -> A e + f0
         f0 = stepped(np.zeros(len(e)))
         A = np.column_stack([stepped(unit) - f0 for unit in np.eye(len(e))])
     for step in range(steps):

@@ -161,7 +161,7 @@ class ModelDerivatives:
         return found
 
     def difference(self, one: Parameter) -> float:
-        """Return the relative difference between dA, dB and fourth-order finite differences."""
+        """Return the relative error of dA and dB, compared with finite differences of order 4."""
         if not one.bodies:
             raise InputError(
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -228,7 +228,7 @@ class ModelDerivatives:
     def fraction(self, changes: Mapping[int, Array]) -> float:
         """Return the relative size of a change dM of M: the spectral radius of M^-1 dM.
 
-        `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of its body}.
+        `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of the joint's body}.
         """
         of_bodies = self._by_inertia(np.eye(len(self._inverse)))
         total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())

@@ -215,7 +215,7 @@ class Block(NamedTuple):
     ranges: tuple[Range, ...]
 
     def values(self, value: float) -> dict[str, float]:
-        """Return {parameter: value} if the block's common value or factor is `value`."""
+        """Return {parameter: value} for a given common value or common factor of the block."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 

@@ -35,9 +35,9 @@ class Parameter:
     part: str
     unit: str
     value: float
-    # {Pinocchio joint: change (10,), per unit, of the dynamic parameters of its body}. The ten
-    # dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz, yz,
-    # zz of the inertia about the joint.
+    # {Pinocchio joint: change (10,), per unit, of the dynamic parameters of the joint's body}. The
+    # ten dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz,
+    # yz, zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
     joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
@@ -63,7 +63,7 @@ class Parameters(dict[str, Parameter]):
         super().__init__((each.name, each) for each in found)
 
     def find(self, key: str) -> list[str]:
-        """Return the names that match a name or pattern.
+        """Return the names of the parameters that match a name or pattern.
 
         Parameters of a body of several links are returned only if the pattern matches no link.
         """
@@ -91,7 +91,7 @@ class Parameters(dict[str, Parameter]):
         """Return why the robot with {parameter: value} is not realisable, or an empty text."""
         try:
             self._bodies(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light to carry them
+            if self._robot.wheels or self._robot.modes:  # a link may be too light for these
                 self.robot(values)
         except InputError as error:
             return str(error)

@@ -127,7 +127,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([not of.refusal(corner) for corner in corners])
-    # The random draws come last. So a search with more draws first repeats the search with fewer.
+    # The random draws come last. So a search with more draws begins like one with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
@@ -170,7 +170,7 @@ class Loops:
         self.lft, self.K = lft, K
 
     def matrices(self, rows: Array) -> tuple[Array, Array]:
-        """Return A - B K and B."""
+        """Return A - B K and B of each loop."""
         A, B, _, _ = self.lft.at(rows)
         return A - B @ self.K, B
 

@@ -338,7 +338,7 @@ class Page:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
         self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
         self.meshcat = Visualizer(window=self.window)
-        self.notes = dict[str, None]()  # about missing drawings
+        self.notes = dict[str, None]()  # notes about missing drawings
         self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         self.drawing = Drawing(self, robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints (without the universe).

@@ -179,7 +179,7 @@ class Playback(NamedTuple):
     """Poses, trails and forces of a motion at N frames."""
 
     poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
-    com: Array  # (N, 3) [m]
+    com: Array  # (N, 3) [m] centre of mass in the world
     force: Array  # (N, 3) [N] on the base, in world axes
     torque: Array  # (N, 3) [N m] on the base, in world axes
     thrust: Array  # (N, k) [N] of k thrusters

@@ -196,8 +196,8 @@ class Bending(NamedTuple):
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
     carrier: int  # Pinocchio joint that carries the appendage
-    frame: pin.SE3  # placement on the carrier
-    modes: list[int]  # indices in q
+    frame: pin.SE3  # placement of the appendage's frame on the carrier
+    modes: list[int]  # indices of the modal amplitudes in q
     twist: Array  # (6, k) per unit of q: translation before rotation
     center: Array  # (3,) centre, in `frame`, of a ball that represents the links
 
