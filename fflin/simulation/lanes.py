@@ -1,7 +1,8 @@
 """The compiled engine, which simulates eight runs in parallel.
 
-The last axis of every array has eight entries, called lanes, one for each run. If there are fewer
-than eight runs, the remaining lanes repeat the last run.
+An array whose values differ between the runs has eight entries in its last axis, one for each run.
+These entries are called lanes. If there are fewer than eight runs, the remaining lanes repeat the
+last run.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,19 +35,19 @@ _KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # the loop is already stored.
 LONG = 20_000
 
-SLOTS = 128  # samples whose noise is stored at a time
+SLOTS = 128  # number of samples for which noise is stored at once
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
-# {name of an array of the loop: its values (N, size) in N runs}; see `Dispersions.in_lanes`.
+# {name of an array of the loop: values (N, size) in each of N runs}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
 def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     """Return the name of the engine for a plan: the requested engine, or the default engine.
 
-    If the compiled loop supports the plan, it is the default engine for many runs. For a single
-    run, it is the default only if the run is long and the machine code of the loop has been stored
-    by an earlier run.
+    The default engine for many runs is the compiled loop, if it supports the plan. For a single
+    run, two further conditions must be true: the run is long, and the machine code of the loop has
+    been stored by an earlier run.
     """
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
@@ -83,7 +84,7 @@ def not_compilable(plan: Plan) -> str:
 
 
 def noise_generator(seed: float) -> np.random.Generator:
-    """Return the random generator for the sensor noise of the run with this seed."""
+    """Return the random generator for the sensor noise of a run with the given seed."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
@@ -105,10 +106,10 @@ class Statistics:
     """Base class for statistics of eight parallel runs; this class collects none."""
 
     every = 1  # steps from one row to the next
-    span = 4096  # steps between calls of `over`; Ctrl-C takes effect after at most so many steps
+    span = 4096  # steps between calls of `over`; Ctrl-C takes effect after at most this many
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of the runs that must end early, from their q and v."""
+        """Return a mask (LANES,) of the runs that must end early, judged by q and v."""
         return np.zeros(len(q), dtype=bool)
 
     def reset(self) -> None:
@@ -117,9 +118,10 @@ class Statistics:
     def add(self, first: int, rows: Array) -> None:
         """Add rows (count, width, LANES) of q, nu, u, momentum and centre of mass.
 
-        The rows are at the multiples of `every`, beginning with the first multiple that is at least
-        `first`. When a run ends, a single row at the step `first` is added for all lanes. The lanes
-        that continue may add this row again.
+        The rows are recorded at steps that are multiples of `every`. The first row is at the first
+        of these steps that is not before the step `first`. When a run ends, this method is called
+        with a single row, at the step `first`, for all lanes. For runs that continue, the next call
+        may contain this row again.
         """
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
@@ -128,10 +130,11 @@ class Statistics:
 
 
 class LaneLoop:
-    """The compiled loop for a plan. Each thread needs its own loop, which contains work space.
+    """The compiled loop for a plan, with memory for eight runs; each thread needs its own loop.
 
     `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
-    u, momentum and centre of mass. `ends` (5,) contains the column after each of these vectors.
+    u, momentum and centre of mass. For each of these five vectors, `ends` (5,) contains the column
+    after its last entry.
     """
 
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
@@ -139,7 +142,7 @@ class LaneLoop:
         if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
         stop = stop_conditions(plan)
-        if runs:  # the sign of each quaternion in `runs` is such that `stop.sign` is positive
+        if runs:  # dispersed runs start with a positive q0; see `StopConditions`
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
@@ -158,7 +161,7 @@ class LaneLoop:
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
-        """Simulate up to eight runs; return for each the reason why it stopped, or an empty text.
+        """Simulate up to eight runs; return why each run ended early, or an empty text.
 
         `runs` contains the values that differ between the runs. Without `runs`, the plan itself is
         simulated. Row i of each array in `out` receives the outcome of run i.
@@ -170,7 +173,8 @@ class LaneLoop:
         statistics.reset()
         most = max(1, min(-(-steps // every), _MEMORY // (8 * LANES * self.width)))
         space = work_space(most * self.width)
-        # A slice of `most * every` steps contains `most` recorded steps, wherever it begins.
+        # The steps are divided into slices. A slice of `most * every` steps contains exactly `most`
+        # recorded steps, whichever step comes first. These rows fit into `space`.
         span = min(most * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)
@@ -200,7 +204,7 @@ class LaneLoop:
                 self._end(statistics, ending, stop[of_lane], out)
                 going &= ~ending
                 # A stop condition in one lane stops the loop for all lanes. A finished lane would
-                # stop it again at every step, so it continues as a copy of a running lane.
+                # stop the loop again at every step, so the lane becomes a copy of a running lane.
                 if going.any():
                     over = ~going[of_lane]
                     for array, _ in self._fresh:
@@ -212,8 +216,8 @@ class LaneLoop:
     def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
         """Write the initial values of all runs; return a function that writes sensor noise.
 
-        The function must be called before each slice, with the first step of the slice and the step
-        after its last.
+        Call this function before each slice of steps. Its arguments are the first step of the slice
+        and the step after the last one.
         """
         for array, initial in self._fresh:
             array[:] = initial
@@ -234,7 +238,7 @@ class LaneLoop:
 
         def sense(step: int, last: int) -> None:
             nonlocal drawn
-            # If the end of a run interrupted the slice, its noise has been drawn already.
+            # If the end of a run interrupted this slice, the noise of the slice is already drawn.
             if not self._noisy or drawn == last:
                 return
             drawn = last
@@ -262,7 +266,7 @@ class LaneLoop:
 
 
 class LaneRows(Statistics):
-    """Recorded rows of a single run, one every `every` steps, with the columns of `LaneLoop`."""
+    """Recorded rows of a single run, with the columns that `LaneLoop` describes."""
 
     def __init__(self, times: Times, width: int) -> None:
         self.every, self.kept = times.every, np.empty((times.rows, width))
@@ -284,7 +288,7 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
             raise
         stopped = f"interrupted at t = {loop.done * dt:g} s"
     if runs is None and not np.isfinite(loop.parts.method.u).all():
-        return go(plan)  # raises an error that names the command
+        return go(plan)  # the Python engine raises an error that names the invalid command
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
@@ -323,7 +327,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
         ),
         law=_law(plan, mechanics, noisy),
         channel=channel._replace(delay=[float(times.delay)]),
-        # The loop writes the values of this reference when it starts.
+        # Placeholder: the values of this reference are written when a simulation starts.
         reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
@@ -335,7 +339,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
 
 
 def mechanics_of(plant: Plant) -> forward.Mechanics:
-    """Return the parameters of a robot and its actuators for the kernel."""
+    """Return the kernel's parameters of the robot and the actuators of a plant."""
     robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
     springs = robot.springs
     assert tree is not None
@@ -355,7 +359,7 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
-    """Return the law of an uncontrolled robot; the law computes states and errors, no commands."""
+    """Return the law of an uncontrolled robot; the law computes states and errors only."""
     law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
@@ -372,8 +376,9 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
 def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     """Return the law of a plan's policy.
 
-    If the policy is an `Allocation`, the law commands the inputs of the robot `design`, and
-    allocates these commands to the inputs of the simulated robot.
+    An `Allocation` contains a policy for another robot, `Allocation.design`. In this case, the law
+    first computes commands for the inputs of that robot. It then allocates these commands to the
+    inputs of the simulated robot.
     """
     asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
     if isinstance(plan.policy, Allocation):
@@ -411,9 +416,10 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
 
 
 def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -> policies.Law:
-    """Return the law of a compensator `policy`, which commands the inputs of `asking`.
+    """Return the law of the compensator `policy`.
 
-    Along a trajectory, the law contains the matrices of the compensator for each sample.
+    The law commands the inputs of the plant `asking`. Along a trajectory, the law contains the
+    matrices of the compensator for each sample.
     """
     state, times, rows = asking.state, plan.times, 1
     loop = policy.bind(asking.robot)
@@ -445,8 +451,8 @@ def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -
 def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
     """Return the allocation of commands to the inputs of the simulated robot.
 
-    The commands are the inputs of the robot in `asking`. The simulated robot has the parameters
-    `giving`, and is the robot of `plant`.
+    The commands are for the inputs of the plant `asking`. The simulated robot is the robot of
+    `plant`, and has the kernel parameters `giving`.
     """
     asks, size = mechanics_of(asking), plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
@@ -464,9 +470,10 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
 def _path(
     path: policies.Path, plan: Plan, policy: TrajectoryFeedback, state: StateMap
 ) -> policies.Path:
-    """Return the trajectory and the gains of a policy.
+    """Return a copy of `path` with the trajectory and the gains of a policy.
 
-    If the run is longer than the trajectory, the end point and its gain are appended.
+    If the run is longer than the trajectory, one more row is appended: the operating point at the
+    end of the trajectory, and the gain for this point.
     """
     motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)

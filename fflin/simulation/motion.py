@@ -28,8 +28,9 @@ from fflin.simulation.report import Passed, Saturated, curves, motion_report, pa
 
 FORMATS = (*record.FORMATS, ".csv")
 
-# Largest accepted jump of a position or rate [SI units] from the end of a phase to the start of the
-# next. It is multiplied by the largest rate at the end of the phase, if this exceeds 1.
+# Tolerance [SI units] of positions and rates when phases are joined: a phase must start where the
+# phase before it ended. If the largest rate at this time exceeds 1, the tolerance is multiplied by
+# that rate.
 _MET = 1e-6
 
 
@@ -386,7 +387,7 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in both])
     u = np.zeros((len(t), len(whole.input_names)))  # missing inputs are zero
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
-    for held in Actuation(state).held:  # in reference axes
+    for held in Actuation(state).held:  # inputs in reference axes
         u[:, held] = u[:, held] @ there.reference.rotation.T @ state.reference.rotation
     rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
     joined: dict[str, Any] = {}

@@ -35,21 +35,22 @@ Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
 # SHORTEST and LONGEST are the bounds [s] of an automatic duration. The duration is determined by a
-# linear simulation with the time step _LOOK [s].
+# linear simulation. If the loop is in continuous time, its time step is _LOOK [s].
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 _STEP = 0.01  # [s] default time step
-# If the inputs of a trajectory jump at its knots, the last stage of a step is evaluated earlier by
-# this fraction of the step, so that an input jump at the end of the step is not yet included.
+# The inputs of a trajectory may jump at the knots of the trajectory. In this case, the last stage
+# of each step is evaluated slightly early, by this fraction of the step. So the stage does not
+# include an input jump at the end of the step.
 _BEFORE = 1e-6
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
 # If a fast pole determines the automatic time step, a run of more than _MANY_STEPS steps (half a
 # minute of computing) causes a warning. If `every` is not given, a run of more than _ENDLESS steps
 # (some hours) is refused.
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000
-# If `every` is not given, all steps of a run with at most _MANY_ROWS steps are recorded. If a run
-# has more steps, only about _FEW_ROWS of them are recorded.
+# If `every` is not given, a run of at most _MANY_ROWS steps records every step. A longer run
+# records only about _FEW_ROWS steps.
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000
-_FOREVER = 1e100  # [s]; its inverse squared does not underflow
+_FOREVER = 1e100  # [s] longest time that is accepted; 1 / _FOREVER^2 does not underflow
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,12 +82,12 @@ class SimulationOptions:
 
 
 class Times(NamedTuple):
-    """Time step `dt` [s] of a simulation; its other times are numbers of steps."""
+    """Time step `dt` [s] of a simulation, and other times as numbers of steps."""
 
     dt: float
     steps: int
     every: int  # steps between recorded rows
-    sample: int  # steps between samples of the law; 0 if it is evaluated at all stages
+    sample: int  # steps between samples of the law; 0 if the law is evaluated at all stages
     delay: int  # steps from a sample to its effect
     notes: tuple[str, ...]  # remarks on the recorded rows, for the report
 
@@ -136,33 +137,35 @@ class Plan:
         self.limits = saturation(
             robot, self.acting, self.q, times.dt, times.sample, pulsed=policy is not None
         )
-        # `initial` contains the inputs (nu,) that act until the first command arrives. If there is
-        # no law, they act throughout the run.
+        # `initial` (nu,) are the inputs that act until the first command arrives. Without a law,
+        # these inputs act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
         # `target` is the target state (nx,) or None. `reference` is a function of time that returns
         # q, v and u of the motion that the policy follows, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
-        # In the first row of the motion, the angle of each continuous joint is within half a turn
-        # of its angle in the state `near` (nx,), or of 0 if `near` is None.
+        # The angle of a continuous joint is unique only up to full turns. In the first row of the
+        # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
+        # If `near` is None, this angle is within half a turn of 0.
         self.near = self.target
         if options.x0 is not None:
             self.near = np.asarray(options.x0, dtype=float)
         elif self.reference:
             self.near = state.read(*self.reference(0.0)[:2])
-        # Whether each step is corrected so that momentum and centre of mass match their prediction.
-        # In orbit, they are not conserved, and not corrected.
+        # Whether each step ends with a correction that sets momentum and centre of mass to their
+        # predicted values. In orbit, momentum is not conserved, so there is no correction.
         self.project = truth("project", options.project) and robot.orbit is None
-        # Indices in v of the angular rates of the base and the revolute joints, whose rotation per
-        # step is limited. Rotors are excluded, because nothing depends on the angle of a rotor.
+        # Indices in v of the rates that are limited, so that no rotation per step is too large: the
+        # angular velocity of the base, and the rates of revolute joints. Rotors are excluded,
+        # because nothing depends on the angle of a rotor.
         rotors, joints = robot.rotors, robot.joints
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
-        self.steered = fed_back(policy)  # states that are known to be fed back
-        # Function of time that returns the measurement noise, if the policy defines it, or None.
+        self.steered = fed_back(policy)  # states that the policy feeds back, if known
+        # Function of time that returns the measurement noise; None if the policy defines no noise.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
@@ -177,15 +180,16 @@ class Plan:
     def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
         """Return a function f(step, *point) that computes the inputs (nu,) of a step.
 
-        f calls `law` with `point` for the command, and `speeds` with `point` for the speeds of the
-        limited wheels. It then applies limits, sample and hold, and the delay.
+        f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds of the wheels
+        whose speed is limited. The actuator channel changes the command: limits, sample and hold,
+        delay and thruster pulses.
         """
         times = self.times
         return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
 
 
 def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
-    """Bind the policy to the robot; return a law that checks its commands, or None if no policy."""
+    """Return the policy, bound to the robot, as a law that checks commands; None if no policy."""
     if policy is None:
         return None
     within = (limits.low, limits.high)
@@ -219,8 +223,8 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
 def _state_of(policy: object, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion.
 
-    If the policy has a frame and a reference, the state map uses them. Otherwise, it uses the frame
-    and the reference of `options`.
+    If the policy has a frame, the state map uses this frame, otherwise the frame in `options`. The
+    same applies to the reference.
     """
     robot, frame, reference = options.robot, options.frame, options.reference
     own_frame, own_reference = axes_of(policy)
@@ -245,7 +249,8 @@ def _state_of(policy: object, options: SimulationOptions) -> StateMap:
 def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
     """Return the inputs (nu,) before the first command.
 
-    Warn if these inputs, or the inputs of a followed trajectory at any time, exceed the limits.
+    Warn if these inputs exceed the limits. If the policy follows a trajectory, warn if the inputs
+    of the trajectory exceed the limits at any time.
     """
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
     # With an allocation, the policy's model has other inputs than the robot.
@@ -295,7 +300,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         )
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
-    # If not every step is recorded, record a sampled policy only at its samples.
+    # If the policy is sampled and not every step is recorded, record only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
     if thinned:
@@ -323,9 +328,10 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 
 
 def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
-    """Return the sample time [s] and 0, or for a continuous policy None and a rate [1/s].
+    """Return the sample time [s] or None, and the rate [1/s] of the fastest pole or 0.
 
-    The rate is the absolute value of the fastest pole of the closed loop, or 0 if it is not known.
+    For a sampled policy, return its sample time and 0. For a continuous policy, return None and the
+    absolute value of the fastest pole of the closed loop, or None and 0 if this pole is not known.
     """
     follows, by = tracking_of(policy), decider(policy)
     if sample is not None:
@@ -353,7 +359,7 @@ def _in_steps(name: str, time: float, dt: float) -> int:
 def _part_of(sample: float, largest: float, *times: float) -> float:
     """Return a time step of at most `largest` [s] that divides the sample time.
 
-    If possible, the step divides all other `times` too.
+    If possible, the step also divides all `times`.
     """
     least = int(np.ceil(sample / largest))
     steps = [sample / parts for parts in range(least, least + 1000)]
@@ -371,9 +377,10 @@ def _positive(name: str, value: object) -> float:
 def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) -> float:
     """Return the time [s] after which the errors of the linear closed loop have settled.
 
-    The errors of attitude, position and joints have each settled once they stay below 1 % of their
-    largest value. The time is rounded up to a multiple of 10 s, and is at least SHORTEST. If the
-    loop does not settle before LONGEST, return SHORTEST.
+    Three errors are considered: attitude, position and the largest joint error. Each of them has
+    settled when it stays below 1 % of its own maximum. States that the policy does not feed back,
+    and wheel angles, are ignored. The time is rounded up to a multiple of 10 s and is at least
+    SHORTEST. If the loop does not settle before LONGEST, return SHORTEST.
     """
     lin, closed = policy.lin, closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)

@@ -39,12 +39,13 @@ _TITLES = {
 }
 JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 
-# A target is at rest if each of its positions changes by less than this [SI units] from row to row.
+# A target is at rest if none of its positions changes by more than this [SI units] from one row to
+# the next.
 _STILL = 1e-12
 
 
 def resting_from(motion: Motion) -> float | None:
-    """Return the time [s] from which a moving target rests.
+    """Return the time [s] at which a moving target comes to rest.
 
     Return None if the target never moves or never comes to rest, or if the motion has phases.
     """
@@ -98,7 +99,7 @@ def plot_motion(
     drawn = charts(motion, show)
     states = [title for title, found in drawn.items() if found[0].group in STATES]
     others = len(drawn) - len(states) + 1  # including the drift
-    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of states and of their errors below
+    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of a chart of states and of the errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
     heights += [3.0] * math.ceil(others / _ACROSS)
@@ -118,7 +119,7 @@ def plot_motion(
             if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
             if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
-                # Joint names are long, so one legend below the charts is valid for all of them.
+                # Joint names are long, so a legend below the charts names the joints of all charts.
                 named = legends.setdefault("joints" if group in JOINTS else title, {})
                 named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
             else:
@@ -149,7 +150,7 @@ def plot_motion(
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
-    """Return {chart title: curves} for the signals in `show`; a chart has only one unit."""
+    """Return {chart title: curves} for the signals in `show`; curves of a chart share a unit."""
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
@@ -164,10 +165,11 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
-    """Return what the panels below the states show, and {state: curve} for these panels.
+    """Return the label and the curves {state: curve} of the panels below the charts of states.
 
-    If the motion follows a reference, the curves are the errors from the reference. Otherwise, they
-    are the differences from the linear prediction. Without a prediction, there are no curves.
+    If the motion follows a reference, the curves are the errors from the reference. Otherwise, the
+    curves are the differences from the linear prediction. If there is neither a
+    reference nor a prediction, there are no curves.
     """
     names, units, what = motion.state_names, motion.state_units, "error"
     if motion.tracked and (e := motion.error) is not None:
@@ -191,7 +193,7 @@ def _draw(
 ) -> None:
     """Draw curves and their limits, with references in pale colours and predictions dashed."""
     group, unit = found[0].group, found[0].unit
-    # Attitude curves have gaps at 180 degrees, where the quaternion changes its sign.
+    # At 180 degrees, the quaternion changes its sign, so attitude curves jump. Leave a gap there.
     for field in ("values", "linear", "reference") if group == "q_b" else ():
         if getattr(found[0], field) is not None:
             rows = np.array([getattr(each, field) for each in found])

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 SETTLED = 0.02
 
 # If an error [SI units] never exceeds THERE, it counts as zero throughout the run. A value below
-# _NOTHING is shown as a dot. The rounding errors of a robot at rest are smaller than both values.
+# _NOTHING appears as a dot in tables. Both limits exceed the rounding errors of a robot at rest.
 THERE, _NOTHING = 1e-9, 1e-14
 
-# An error counts as settled only if it stays small during this last fraction of the rows of a run,
-# or longer.
+# An error counts as settled only if it stays small during the last part of a run. DWELL is the
+# length of this part, as a fraction of all rows.
 DWELL = 0.05
 
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3
 
-_MOST, _NAMED = 8, 4  # most lines of a list, and most saturated inputs named in the first line
+_MOST, _NAMED = 8, 4  # largest number of lines of a list, and of saturated inputs in a line
 
 _OF_PHASES = (
     "|p|: linear momentum; |h|: angular momentum about the centre of mass;\n"
@@ -57,13 +57,14 @@ _NEAR = 1.0 / 3.0
 
 
 class Curve(NamedTuple):
-    """Values (N,) of a state, input or wheel momentum, with its limits.
+    """Values (N,) and limits of a state, input or wheel momentum.
 
-    `linear` (N,) is the linear prediction and `reference` (N,) the followed reference, if any.
+    If they exist, `linear` (N,) is the linear prediction, and `reference` (N,) is the reference
+    that the robot follows.
     """
 
     key: str  # GROUP.NAME
-    group: str  # "speed" and "momentum" of wheels
+    group: str  # "speed" or "momentum" for wheels
     name: str
     unit: str
     values: Array
@@ -83,7 +84,7 @@ class Curve(NamedTuple):
 
     @property
     def near(self) -> list[float]:
-        """Limits of which the values reach at least the fraction _NEAR."""
+        """Limits that the curve comes near: some value is at least _NEAR times the limit."""
         return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
 
 
@@ -159,8 +160,8 @@ def saturated(t: Array, found: Iterable[Curve]) -> tuple[Saturated, ...]:
     """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first."""
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
     for curve in found:
-        # Use a larger margin for wheel speeds: they only approach their limit, but inputs are
-        # clipped exactly at theirs.
+        # Inputs are clipped exactly at their limits. Wheel speeds only approach their limits, and
+        # therefore need a larger margin.
         margin = 1e-3 if curve.group == "speed" else 1e-9
         enforced = curve.group not in (*STATES, "momentum")
         for limit in curve.levels if enforced else ():
@@ -185,7 +186,7 @@ def _shown(value: float) -> str:
 
 
 def settled_at(sizes: Array) -> Indices:
-    """Return the row from which each error in `sizes` (N, ...) is settled, or N if it is never."""
+    """Return the row at which each error in `sizes` (N, ...) settles, or N if it never settles."""
     outside = sizes > np.maximum(SETTLED * sizes.max(axis=0), THERE)
     first = len(sizes) - outside[::-1].argmax(axis=0)
     return np.where(outside.any(axis=0), first, 0)
@@ -231,9 +232,9 @@ def _cells(*values: float) -> list[str]:
 def error_sizes(motion: Motion) -> list[ErrorSize]:
     """Return the sizes of each kind of error, or an empty list if the motion has no target.
 
-    The size of attitude errors is the angle [deg]. For every other kind, it is the largest absolute
-    error of a state of this kind. Wheel speeds and modes are not counted as joints, but as separate
-    kinds. Wheel angles are excluded, because nothing depends on them.
+    The size of the attitude error is an angle [deg]. For every other kind, the size is the largest
+    absolute error of the states of this kind. Wheel speeds and modes are separate kinds, and not
+    counted as joints. Wheel angles are excluded, because nothing depends on them.
     """
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -314,8 +315,8 @@ def motion_record(motion: Motion) -> dict[str, object]:
     t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     errors = error_sizes(motion)
-    # The errors of revolute and of prismatic joints have the same title but different units. If
-    # both exist, the unit is added to the name.
+    # The errors of revolute and of prismatic joints have the same title but different units. For a
+    # robot with both kinds of joints, the unit is added to the title.
     count = Counter(each.title for each in errors)
     keys = [f"{x.title} [{x.unit}]" if count[x.title] > 1 else x.title for x in errors]
     return {
@@ -332,16 +333,17 @@ def motion_record(motion: Motion) -> dict[str, object]:
 
 
 def _phases(motion: Motion) -> list[list[str]]:
-    """Return the table of phases; without impacts if the motion was read from a file."""
+    """Return the table of phases; it has no impacts if the motion was read from a file."""
     table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
     parts = motion._phases or motion.phases
     pairs = zip((None, *parts), parts, strict=False)
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
-        # A line of the table is (label, index of a row of the motion, energy and momentum that are
-        # added to those of the row). The rows contain only the values after an impact. In the line
-        # for the time before it, the energy and momentum that the impact removed are added.
+        # `lines` are the lines of the table for one phase: (label, index of a row of the motion,
+        # energy to be added, momentum to be added). At an impact, the row of the motion contains
+        # the values after the impact. So the line "before" adds the energy and the momentum that
+        # the impact removes.
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)
@@ -383,7 +385,7 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
         said = f"settled: {which}at the target throughout the run"
     if aside:
         said += f"; not controlled: {_and(aside)}"
-    shares: dict[str, float] = {}  # of the run at a limit, summed over both limits
+    shares: dict[str, float] = {}  # fraction of the run at the lower or upper limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share
     full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
@@ -396,7 +398,7 @@ def _and(words: list[str]) -> str:
 
 
 def _largest_modes(motion: Motion) -> str:
-    """Return a table with the largest amplitude of each mode and the rotation that it causes."""
+    """Return a table with each mode's largest amplitude, and the rotation at this amplitude."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):

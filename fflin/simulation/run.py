@@ -1,8 +1,10 @@
 """The Python engine: accelerations, conserved quantities, and the simulation loop.
 
-Without external forces, the momentum about a fixed point is constant, and the centre of mass is at
-r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m. In orbit, the momentum is not
-constant. The Jacobi integral (14.3) is constant if inputs, disturbance and dampers do no work.
+Without external forces, the momentum about a fixed point is constant. The centre of mass is then at
+r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m.
+
+In orbit, the momentum is not constant. The Jacobi integral (14.3) is constant if inputs,
+disturbance and dampers do no work.
 """
 
 from __future__ import annotations
@@ -33,11 +35,11 @@ if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
 
 # Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force on the
-# base and torque on the base, both in base axes, then the forces or torques of the joints.
+# base, torque on the base, forces or torques of the joints. The first two are in base axes.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Above this velocity [SI units], the motion has diverged. A disturbance that is not finite then
-# raises no error.
+# Above this velocity [SI units], the motion has diverged. After this point, a disturbance that is
+# not finite raises no error.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -45,7 +47,7 @@ STOPS = ("", "diverged", "left the chart", "stopped")
 
 LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
 _LOOK = 16  # steps between checks of the clock
-_LARGEST_SHOWN = 1e3  # [rad] per step, above which a message does not give the number
+_LARGEST_SHOWN = 1e3  # [rad] largest rotation per step that a message states
 
 _aba, _crba, _placement = pin.aba, pin.crba, pin.XYZQUATToSE3
 
@@ -67,8 +69,7 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         nu, groups = len(self.actuation.names), self.actuation.groups
-        # Indices in u of the first component of the base torque and of the base force, if these are
-        # inputs.
+        # Indices in u at which the base torque and the base force begin, if they are inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
@@ -78,22 +79,22 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         self._columns = state.lift(self.actuation.fixed)
-        # True if, without a disturbance, the inputs are the only forces, and B_u is constant.
+        # True if B_u is constant, and the inputs are the only forces apart from a disturbance.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,), and the wrench (6,) of inputs and disturbance on the whole robot.
+        """Return dv/dt (nv,), and the external wrench (6,) of inputs and disturbance.
 
-        The wrench consists of force and torque in base axes. It does not include gravity. In orbit,
-        the wrench is replaced by [power, 0, 0, 0, 0, 0], with the total power [W] of inputs,
-        disturbance and dampers.
+        The wrench consists of the force and the torque on the robot about the base, in base axes.
+        Gravity is not included. In orbit, the wrench is replaced by [power, 0, 0, 0, 0, 0], with
+        the total power [W] of inputs, disturbance and dampers.
         """
         if self._faulty:
             given = np.empty(len(u))
             apply_faults(self.faults, self.triads, t, u, given)
             u = given
-        if self.actuation.held:  # rotated by R instead of the chart, which is singular at 180 deg
+        if self.actuation.held:  # use R, because the chart is singular at 180 deg
             R, u = self.state.rotation(q), u.copy()
             for held in self.actuation.held:
                 u[held] = u[held].dot(R)
@@ -140,15 +141,15 @@ class Conserved:
     momentum: Array  # (6,) after the steps so far
     wrenches: tuple[Array, ...]  # (6,) about the fixed point at each stage; written by the caller
 
-    # The fixed point is the initial position of the base. About the origin of the world, momenta
-    # would have large rounding errors if the robot is far away from the origin.
+    # The fixed point is the initial position of the base. Far away from the world's origin, angular
+    # momentum about the origin would have large rounding errors.
 
     def __init__(self, plan: Plan) -> None:
         robot, start = plan.plant.robot, plan.q[:3]
         self._robot, self._model, self.mass = robot, robot.model, robot.mass
         self._field, self._stored = plan.plant.field, robot.stored_momentum
         self._data = data = robot.create_data()
-        self._M = data.M[:6]  # CRBA writes into it
+        self._M = data.M[:6]  # CRBA writes into this array
         self._M_bb = self._M[:, :6]
         self._start = np.concatenate((start, np.zeros(4)))
         self._x, self._y, self._z = start.tolist()  # numbers are faster than arrays
@@ -158,14 +159,15 @@ class Conserved:
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
-        # The centre of mass at time t is the first column plus t times the second. The first column
-        # is its initial position plus the displacement by the external impulse so far. The second
-        # column is its initial velocity.
+        # The centre of mass at time t is the first column of `_line` plus t times the second. The
+        # first column is the initial centre of mass plus the displacement by the external impulse
+        # so far. The second column is the initial velocity of the centre of mass.
         self._line = np.column_stack((self._center, self.momentum[:3] * per_mass))
         self._time = np.ones(2)
-        # Rows: the impulse so far (6,), the displacement of the centre of mass that it causes (the
-        # first three entries), and the wrench (6,) at each stage of a step. If no external forces
-        # act, all rows are exactly zero.
+        # The first row of `_stack` is the external impulse so far (6,). The first three entries of
+        # the second row are the displacement of the centre of mass by this impulse. The other rows
+        # are the wrenches (6,) at the stages of a step. If no external forces act, all rows are
+        # exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
@@ -175,7 +177,7 @@ class Conserved:
     def wrench(self, q: Array, push: Array) -> Array:
         """Return the wrench (6,) about the fixed point in world axes, including the weight.
 
-        `push` (6,) is the wrench in base axes without the weight. In orbit, `push` is returned.
+        `push` (6,) is the wrench in base axes without the weight. In orbit, return `push` itself.
         """
         if self._field:
             return push
@@ -190,7 +192,7 @@ class Conserved:
         return total
 
     def advance(self) -> None:
-        """Advance momentum and centre of mass by one step, whose stages have the `wrenches`."""
+        """Advance momentum and centre of mass by a step with the current `wrenches`."""
         self._sums[:] = impulse, displacement = self._after.dot(self._stack)
         self.momentum = self._momentum + impulse
         self._line[:, 0] = self._center + displacement[:3]
@@ -201,11 +203,14 @@ class Conserved:
         return self._line.dot(self._time)
 
     def impose(self, t: float, q: Array, v: Array) -> None:
-        """Correct the base in `q` and `v` so that centre of mass and momentum are as predicted."""
-        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m), where c_b is the centre of
-        # mass and H_b the momentum, both relative to the base and in base axes. The equation for
-        # nu_b is solved for the correction of nu_b, which is small, and so are its rounding errors.
-        # M is in base axes, and therefore does not depend on the position of the base.
+        """Correct the base position in `q` and the base velocity in `v`.
+
+        After the correction, centre of mass and momentum are equal to their predictions at time t.
+        """
+        # Set r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m). Here c_b is the centre of
+        # mass and H_b the momentum, both relative to the base and in base axes. The second equation
+        # is solved for the correction of nu_b. This correction is small, and therefore has small
+        # rounding errors. M is in base axes, and therefore does not depend on the base position.
         momentum = self.momentum
         _crba(self._model, self._data, q)
         if self._stored:
@@ -228,10 +233,17 @@ class Conserved:
     def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
 
-        They are, in this order: energy (N,), momentum about the centre of mass (N, 6), centre of
-        mass (N, 3), momentum about the fixed point (N, 6), and the upper bounds (2,) of linear and
-        angular momentum (11.5). In orbit, the energy is the Jacobi integral. This integral and five
-        zeros replace the momentum about the fixed point, and its largest terms replace the bounds.
+        The five arrays are, in this order,
+
+        - the energy (N,);
+        - the momentum about the centre of mass (N, 6);
+        - the centre of mass (N, 3);
+        - the momentum about the fixed point (N, 6);
+        - the upper bounds (2,) of linear and angular momentum (11.5).
+
+        In orbit, the energy is the Jacobi integral. The momentum about the fixed point is replaced
+        by the Jacobi integral and five zeros. The bounds are replaced by the size of the largest
+        terms of the Jacobi integral and a zero.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
@@ -241,8 +253,8 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             pin.ccrba(model, data, q_i, v_i)
-            # `ccrba` also computes this momentum, but sums it about the origin, which causes larger
-            # rounding errors.
+            # `ccrba` also computes the momentum about the centre of mass, but from sums about the
+            # origin, which have larger rounding errors.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
@@ -285,7 +297,7 @@ class Recording(NamedTuple):
     v: Array
     u: Array
     momentum: Array  # (N, 6) from the external impulse; see `Conserved`
-    center: Array  # (N, 3) centre of mass from this momentum
+    center: Array  # (N, 3) predicted centre of mass
     steps: int  # number of steps that were begun
     stopped: str  # reason if the run ended early, or an empty text
     engine: str  # name of the engine
@@ -294,13 +306,13 @@ class Recording(NamedTuple):
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
-    """Simulate a plan in Python; the progress bar of a long run shows `hint`."""
+    """Simulate a plan in Python; the progress bar of a long run shows the text `hint`."""
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
     dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
-    # Method that integrates the policy's own state, or None if the policy has no state.
+    # Function that integrates the state of the policy, or None if the policy has no state.
     follow = getattr(law.policy, "advance", None) if law else None
     weights = plan.method.step_weights(dt)[1]
     pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt

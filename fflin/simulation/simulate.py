@@ -29,8 +29,8 @@ from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptio
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
 
 # Linear model that predicts a motion, and a function that returns the command (nu,) for a deviation
-# from the operating point. The deviation consists of the states of the robot. If the controller is
-# in continuous time, its states follow.
+# from the operating point. The deviation contains the states of the robot. If the controller is in
+# continuous time and has states, the deviation also contains these states, at the end.
 Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
 # After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
@@ -220,7 +220,7 @@ def simulate(
 
 
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
-    """Build the motion from the recorded rows of a run, with a linear prediction by `foresees`."""
+    """Build the motion from the recorded rows of a run; `foresees` computes the prediction."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -310,7 +310,7 @@ def predictor(plan: Plan) -> Predictor | None:
         if policy is None:
             none = np.zeros(len(lin.u0))
             return lin, lambda _: none
-        gain = getattr(policy, "K", None)  # an allocation has none, because it is nonlinear
+        gain = getattr(policy, "K", None)  # an allocation is nonlinear and has no gain
         if own is not None and gain is not None:
             K, constant, _ = StateFeedback(own, gain).terms(state)
             at_point = constant - K @ lin.x0
@@ -332,16 +332,16 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     Return no rows if the model cannot predict a motion, or if the prediction is not finite.
     """
     lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
-    if lin is None:  # a model in discrete time without its motion between samples
+    if lin is None:  # a discrete-time model without its continuous-time model
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of their speeds in x
+    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of limited wheel speeds in x
     applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 
     def stepped(e: Array) -> Array:
-        """Return e after one step of the classical Runge-Kutta method."""
+        """Return the deviation e after one step of the classical Runge-Kutta method."""
         after, rate = e, np.zeros(len(e))
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             at = e + share * dt * rate
@@ -352,7 +352,7 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     cuts = not sample and plan.limits.cuts
     held = lin.discretize(dt) if sample else lin
     A, B, f0 = held.A, held.B, held.f0
-    if not (sample or cuts):  # a step is then e -> A e + f0
+    if not (sample or cuts):  # in this case, a step is e -> A e + f0
         f0 = stepped(np.zeros(len(e)))
         A = np.column_stack([stepped(unit) - f0 for unit in np.eye(len(e))])
     for step in range(steps):

@@ -1,8 +1,9 @@
 r"""Derivatives of a linear model with respect to the robot's parameters.
 
 The inertia matrix M and the inverse dynamics (RNEA) are linear in the ten dynamic parameters of
-each body. So the derivative of M with respect to one of these parameters is M of a robot in which
-this parameter is 1 and all others are 0. The same is true for RNEA.
+each body. So the derivative of M with respect to one of these parameters is equal to M of another
+robot. In that robot, this parameter is 1 and all other parameters are 0. Likewise, the derivative
+of RNEA is equal to RNEA of that robot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,8 +35,9 @@ WEIGH = (CenterOfMass, Momentum)
 
 # Relative change of M in one step of the finite differences.
 _STEP = 2e-3
-# If a step changes A by less than this fraction of A, rounding errors dominate the finite
-# differences. Errors of dA are then relative to this fraction of A. The same applies to B.
+# Errors of dA are divided by the largest entry of dA. But if a step changes A by less than this
+# fraction of A, rounding errors dominate the finite differences. In this case, errors of dA are
+# divided by the derivative that would change A by this fraction in a step. The same applies to B.
 _LEAST = 1e-6
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -91,9 +93,9 @@ class ModelDerivatives:
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..), one entry for each of P parameters."""
-        # Row i of `rates` belongs to parameter i. One more row, the last, contains zeros. Because
-        # `assemble` is an affine function of `rates`, this last row gives the constant part of A,
-        # B and f0, which is subtracted below.
+        # Row i of `rates` belongs to parameter i. An additional last row contains zeros. `assemble`
+        # is an affine function of `rates`. For the row of zeros, it returns the constant part of
+        # A, B and f0. This constant part is subtracted below.
         state, ready, count, nv = self._state, self._ready, len(parameters) + 1, len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
@@ -124,9 +126,9 @@ class ModelDerivatives:
 
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # Each of these outputs, multiplied by the robot's mass, is a quadratic function of the
-        # parameter, because `weighed` changes the accelerations linearly. So the derivative
-        # follows exactly from three values with any step, see (12.2a).
+        # `weighed` returns [C, D, y0] for these outputs, multiplied by the robot's mass. The result
+        # is a quadratic function of the parameter, because `weighed` changes the accelerations
+        # linearly. So three values at any step size give the exact derivative, see (12.2a).
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
@@ -159,7 +161,7 @@ class ModelDerivatives:
         return found
 
     def difference(self, one: Parameter) -> float:
-        """Return the relative difference between dA, dB and fourth-order finite differences."""
+        """Return the relative error of dA and dB, compared with finite differences of order 4."""
         if not one.bodies:
             raise InputError(
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -197,8 +199,9 @@ class ModelDerivatives:
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
-            # If only one body of the model has an inertia, RNEA returns F_p of (12.1) for this
-            # body, and the derivatives of F_p with respect to q_m, nu and base rotations.
+            # In the model `lone`, only one body has an inertia. For this model, RNEA returns F_p of
+            # (12.1) for this body. The derivatives of RNEA are the derivatives of F_p with respect
+            # to q_m, nu and base rotations.
             lone = self.robot.model.copy()
             lone.armature = np.zeros_like(lone.armature)
             for joint in range(lone.njoints):
@@ -225,7 +228,7 @@ class ModelDerivatives:
     def fraction(self, changes: Mapping[int, Array]) -> float:
         """Return the relative size of a change dM of M: the spectral radius of M^-1 dM.
 
-        `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of its body}.
+        `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of the joint's body}.
         """
         of_bodies = self._by_inertia(np.eye(len(self._inverse)))
         total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())
@@ -255,7 +258,7 @@ class ModelDerivatives:
         """
         state, data, q, gradient = self._state, self._data, self._q, self._gradient
         by_turn: Array = np.zeros((len(self._v), 3))
-        if gradient:  # before RNEA, because this call overwrites Pinocchio's results
+        if gradient:  # before RNEA, because `force` overwrites results in `data`
             pull, pull_by_q, by_turn = gradient.force(model, data, q)
         a = state.spread(self._rates.c)
         by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, self._v, a)
@@ -311,9 +314,9 @@ class ModelDerivatives:
 
 
 def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:
-    """Change the bodies of `model` that depend on a parameter.
+    """Set the bodies of `model` that depend on a parameter.
 
-    They become the bodies of the model `before`, with the parameter changed by `size`.
+    The bodies are taken from the model `before`, with the parameter increased by `size`.
     """
     for joint, change in one.bodies.items():
         changed = before.inertias[joint].toDynamicParameters() + size * change

@@ -4,23 +4,24 @@ r"""Linear-fractional models: A and B as exact functions of uncertain parameters
 :math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`. Here :math:`\delta_k` is between -1 and 1, and
 :math:`E_{r_k}` is the identity of size :math:`r_k`.
 
-If the robot has the generalised accelerations a, the inertial force of each link is the generalised
+For the generalised accelerations a of the robot, the inertial force of a link is the generalised
 force F:
 
     s = T X a,   f = D s,   F = X^T T^T f
 
-X is the Jacobian of the link's centre of mass in the axes of its inertia, and D = blkdiag(m E, I)
-contains the mass m and the inertia I. T shifts an uncertain centre of mass; it is the identity E if
-the centre of mass is known. Each parameter of a link multiplies :math:`r_k` signals:
+X is the Jacobian of the link's centre of mass, in the axes of the link's inertia. The matrix
+D = blkdiag(m E, I) contains the mass m and the inertia I. T shifts an uncertain centre of mass. If
+the centre of mass is known, T is the identity E. Each parameter of a link multiplies :math:`r_k`
+signals:
 
 - 3 for a mass,
 - 6 for a density,
 - 1 for a diagonal entry of the inertia, and 2 for an off-diagonal entry,
 - 4 for a coordinate of the centre of mass: 2 in T and 2 in T^T.
 
-These numbers are minimal: no :math:`r_k` can be smaller than the rank of the derivative of the
-inertia matrix M with respect to the parameter, and these numbers are equal to this rank. The reason
-is that X has full rank on a free base.
+These numbers are minimal. No :math:`r_k` can be smaller than the rank of the derivative of the
+inertia matrix M with respect to the parameter. Because X has full rank on a free base, each number
+is equal to this rank.
 """
 
 from __future__ import annotations
@@ -214,7 +215,7 @@ class Block(NamedTuple):
     ranges: tuple[Range, ...]
 
     def values(self, value: float) -> dict[str, float]:
-        """Return {parameter: value} if the block's common value or factor is `value`."""
+        """Return {parameter: value} for a given common value or common factor of the block."""
         delta = (value - self.middle) / self.half
         return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
 
@@ -228,10 +229,10 @@ def linear_fractional(
 ) -> LFT:
     """Return the LFT of a model about an operating point at rest, without steady forces."""
     form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
-    # Terms of M can contain products of two parameters of the same link, and stiffnesses and
-    # dampings can contain products of two parameters of the same mode. Therefore all parameters of
-    # a link or mode are added together. `together` is {(link or mode, joint): {part: index of the
-    # parameter}}.
+    # M contains products of the parameters of a link, such as mass and centre of mass. The damping
+    # force of a mode contains the product of its frequency and damping ratio. Therefore all
+    # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
+    # index of the parameter}}.
     together: dict[tuple[str, int], dict[str, int]] = {}
     sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
     modes = sprung & {joint.name for joint in ready.robot.modes}
@@ -278,8 +279,8 @@ class _Form:
     """Linear-fractional form under construction.
 
     A signal, such as an entry of z or of the force, is a linear combination of the entries of
-    (a, x, u, w). It is stored as the row of its coefficients. Each parameter adds entries to z, and
-    terms to the force.
+    (a, x, u, w). The signal is stored as a row of coefficients. Each parameter adds entries to z,
+    and terms to the force.
     """
 
     def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
@@ -297,7 +298,7 @@ class _Form:
         self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
         self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
-        # `z` reserves _MOST rows for each parameter. `used` counts the rows that are in use.
+        # For each parameter, `z` reserves _MOST rows, and `used` counts the rows in use.
         self.used = np.zeros(len(ranges), dtype=np.intp)
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
         # Inertial forces plus spring and damper forces minus input forces. By the equation of
@@ -309,7 +310,7 @@ class _Form:
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 
     def parts(self, signals: Array) -> list[Array]:
-        """Split signals (.., k) into views of their coefficients of a, x, u and w."""
+        """Split signals (N, k) into views of their coefficients of a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
     def times(self, at: int, signals: Array) -> Array:
@@ -326,7 +327,7 @@ class _Form:
         return (middle - one.value) * signals + self.unit[self.ends[2] :][rows]
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
-        """Replace the nominal inertial force of a link by its force with uncertain parameters."""
+        """Replace the nominal inertial force of a link by the force with uncertain parameters."""
         J = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
         shifts = []
         for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
@@ -360,7 +361,7 @@ class _Form:
         """Add the effect of a parameter of a joint, thruster or wheel.
 
         M, the spring and damper forces, and the input forces contain no product of this parameter
-        and another one. So it is added alone.
+        and another one. So the effect of this parameter can be added independently of the others.
         """
         one = self.ranges[at].parameter
         if one.joint >= 0:
@@ -377,8 +378,8 @@ class _Form:
                 for joint, parameters in one.bodies.items()
             )
             values, vectors = np.linalg.eigh(change)
-            # The inertia of a wheel is added to the wheel and subtracted from its carrier, so the
-            # change of M has rank 2.
+            # The inertia of a wheel is added to the wheel, and subtracted from the body that
+            # carries the wheel. So the change of M has rank 2.
             most = np.argsort(-np.abs(values))[:2]
             L = vectors[:, most]
             self.force += L @ self.times(at, (values[most, None] * L.T) @ self.a)
@@ -386,8 +387,8 @@ class _Form:
     def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
         """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta dx/dt).
 
-        I is the inertia of the mode. The frequency omega and the damping ratio zeta of the mode can
-        be uncertain.
+        x is the amplitude of the mode, and I its inertia. The frequency omega and the damping ratio
+        zeta of the mode can be uncertain.
         """
         joint, springs = self.state.robot.joints[index], self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]

@@ -29,21 +29,21 @@ _TURN = 2.0 * math.pi  # [rad]
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter, such as "inertia.xx" of "arm", and its effect: how the robot changes per unit."""
+    """Parameter, such as "inertia.xx" of "arm", and the change of the robot per unit."""
 
     of: str
     part: str
     unit: str
     value: float
-    # {Pinocchio joint: change (10,), per unit, of the dynamic parameters of its body}. The ten
-    # dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz, yz,
-    # zz of the inertia about the joint.
+    # {Pinocchio joint: change (10,), per unit, of the dynamic parameters of the joint's body}. The
+    # ten dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz,
+    # yz, zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    joint: int = -1  # joint whose spring or damper changes, in state order; -1 for none
+    joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). The wrench is the
-    # derivative, with respect to this parameter, of the wrench that an input of 1 applies.
+    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). To first order, this
+    # is the change, per unit of the parameter, of the wrench that a unit input exerts.
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -53,7 +53,7 @@ class Parameter:
 
 
 class Parameters(dict[str, Parameter]):
-    """Parameters of a robot by name; a body of one link can also be named by its joint."""
+    """Parameters of a robot by name; a body of one link can be named by its link or joint."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
@@ -63,9 +63,9 @@ class Parameters(dict[str, Parameter]):
         super().__init__((each.name, each) for each in found)
 
     def find(self, key: str) -> list[str]:
-        """Return the names that match a name or pattern.
+        """Return the names of the parameters that match a name or pattern.
 
-        A pattern matches a body of several links only if it matches no link.
+        Parameters of a body of several links are returned only if the pattern matches no link.
         """
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
@@ -76,9 +76,11 @@ class Parameters(dict[str, Parameter]):
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
-        """Return the names of all parameters that match `only`, or of all parameters for None.
+        """Return the names of the parameters that match `only`.
 
-        The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern.
+        The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern. If
+        `only` is None, all parameters match.
+
         Parameters of a body of several links are left out if other parameters match.
         """
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
@@ -86,10 +88,10 @@ class Parameters(dict[str, Parameter]):
         return [name for name in found if self[name].of not in self._sums] or found
 
     def refusal(self, values: Mapping[str, float]) -> str:
-        """Return why {parameter: value} is not physically realisable, or an empty string."""
+        """Return why the robot with {parameter: value} is not realisable, or an empty text."""
         try:
             self._bodies(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light for them
+            if self._robot.wheels or self._robot.modes:  # a link may be too light for these
                 self.robot(values)
         except InputError as error:
             return str(error)
@@ -132,7 +134,7 @@ class Parameters(dict[str, Parameter]):
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
         """Return {joint: body} for all bodies with a changed link.
 
-        The joint indices are the ones of the Pinocchio model without wheels. If a changed link is
+        The joints are numbered as in the Pinocchio model without wheels. If a changed link is
         not physically realisable, raise `InputError`.
         """
         model, bare = self._robot.model, self._robot._bare.model
@@ -148,7 +150,7 @@ class Parameters(dict[str, Parameter]):
             mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
             density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
             # An unchanged inertia is always accepted, for example zero for a point mass. If the
-            # nominal inertia is not physically realisable, a change must not make it worse.
+            # nominal inertia is not physically realisable, the changed one must not be worse.
             was, least = (
                 float(np.linalg.eigvalsh(0.5 * np.trace(J) * np.eye(3) - J)[0])
                 / (np.trace(J) or 1.0)

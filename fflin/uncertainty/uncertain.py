@@ -115,7 +115,7 @@ class Uncertain:
         return known.robot(found)
 
     def refusal(self, delta: Array) -> str:
-        """Return why the robot with deltas (k,) is not physically realisable, or an empty text."""
+        """Return why the robot with deltas (k,) is not physically realisable, or ""."""
         values = dict[str, float]()
         for block, d in zip(self.blocks, delta, strict=True):
             values |= block.values(block.middle + block.half * d)
@@ -334,7 +334,7 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
             )
         return Block(key, units.pop(), ranges[0].middle, ranges[0].half, tuple(ranges))
     relative = abs(number(key, value))
-    # The half width of each parameter has the sign of its nominal value. So a positive delta
+    # The half width of a range has the sign of the parameter's nominal value. So a positive delta
     # increases the magnitudes of all tied parameters.
     scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _CORNERS = 256
 # Largest number of steps of a local search, and trial lengths of a step relative to half a range.
-# Steps that leave the range are cut at its ends, so the length 1e9 leads to a corner of the set.
+# Steps are cut off at the ends of the ranges, so the length 1e9 leads to a corner of the set.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # In each step, the exact criterion is computed for _HELD trial points. The quick criterion uses
 # _FREQUENCIES frequencies. Gradients are finite differences with the step _DIFFERENCE.
@@ -31,15 +31,15 @@ _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# slycot is used for at most this number of signals, because its run time grows with the fifth power
-# of the number of signals.
+# slycot is used only for models with at most this number of signals. Its run time grows with the
+# fifth power of the number of signals.
 _SIGNALS = 24
-# _LOOK is the number of frequencies in the first grid. _INSIDE is the number of frequencies checked
-# in an interval. _DIVISIONS is the largest number of steps, each of which divides an interval or
-# calls slycot.
+# The search over frequency begins with a grid of _LOOK frequencies. The bound of an interval is
+# computed at _INSIDE frequencies. A step of the search divides one interval, or calls slycot for
+# it. The search takes at most _DIVISIONS steps.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
-# The search ends if the largest bound of an interval is at most this factor times the largest bound
-# at a single frequency.
+# The search ends when the largest bound of an interval is at most this factor times the largest
+# bound at a single frequency.
 _NEAR = 1.01
 
 Scaling: TypeAlias = tuple[Array, Array]  # d > 0 and g, (n,) each
@@ -127,7 +127,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([not of.refusal(corner) for corner in corners])
-    # The random draws come last. So a search with more draws first repeats the search with fewer.
+    # The random draws come last. So a search with more draws begins like one with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
@@ -156,7 +156,7 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
 
 
 class Gain(NamedTuple):
-    """Channel whose gain is bounded: from w to C x + D w, with the input disturbance scale * w."""
+    """Channel from w to C x + D w, where scale * w is a disturbance at the inputs."""
 
     C: Array
     D: Array
@@ -170,7 +170,7 @@ class Loops:
         self.lft, self.K = lft, K
 
     def matrices(self, rows: Array) -> tuple[Array, Array]:
-        """Return A - B K and B."""
+        """Return A - B K and B of each loop."""
         A, B, _, _ = self.lft.at(rows)
         return A - B @ self.K, B
 
@@ -220,7 +220,7 @@ class Loops:
 
 
 def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
-    """Return the largest criterion found by local searches, and its deltas.
+    """Return the largest criterion that local searches find, and the deltas where it occurs.
 
     The first search starts at the first sample. A new search starts at each later sample whose
     criterion exceeds the largest one found so far. So the result is at least the criterion of every
@@ -259,7 +259,7 @@ def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> 
 def _safe(loops: Loops) -> float:
     """Return the inverse of the largest bound of mu over all frequencies.
 
-    If all ranges are scaled by less than this factor, all loops are stable.
+    If all ranges are scaled by less than the returned factor, all loops are stable.
     """
     lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
@@ -274,9 +274,9 @@ def _safe(loops: Loops) -> float:
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
-# parameters, mu can be a discontinuous function of the frequency. So a bound at two frequencies
-# need not hold between them. But the bound that a fixed scaling gives is a continuous function of
-# the frequency. Therefore one scaling is used for a whole interval of frequencies.
+# parameters, mu can be a discontinuous function of the frequency. So a bound that holds at two
+# frequencies may not hold between them. The bound for a fixed scaling, however, is a continuous
+# function of the frequency. Therefore one scaling is used for a whole interval of frequencies.
 
 
 def perron(Z: Array) -> Array:
@@ -319,7 +319,7 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound for frequencies a to b, its scaling, and the bound at the middle."""
+        """Return the bound over [a, b], the scaling that gives it, and the bound at (a + b)/2."""
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]

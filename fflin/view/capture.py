@@ -33,8 +33,8 @@ _ARGUMENTS = (
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
 
-# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. It exits when
-# these pipes are closed, as they are at the end of this process.
+# Chromium reads commands from file descriptor 3 and answers on file descriptor 4. Both are pipes to
+# this process. When this process ends, the pipes are closed, and Chromium exits.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
@@ -90,8 +90,8 @@ def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
 def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
     """Return a PNG of the page at each time.
 
-    If `keys` is negative, all pictures show the whole page. Otherwise, they show only the scene.
-    The first pictures also show a legend; their number is `keys`.
+    If `keys` is negative, every picture shows the whole page. Otherwise, every picture shows only
+    the scene, and the first `keys` pictures also show a legend.
     """
     program = find_chromium()
     try:
@@ -132,9 +132,9 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # The browser writes its temporary files into this folder, which is removed at the end.
-            # The browser also creates a socket in it, whose path may have at most about 100
-            # characters. So if the path of this folder is long, the browser uses its default one.
+            # Temporary files of the browser go into `folder`, which is removed at the end. One of
+            # these files is a socket, whose path may have at most about 100 characters. So if the
+            # path of `folder` is long, the browser uses the default folder for temporary files.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
@@ -145,8 +145,8 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
                 timer.start()
                 browser = _Browser(process)
                 yield browser, folder
-                # When its command pipe is closed, the browser exits and removes its temporary
-                # files. If it were killed at once, these files would remain.
+                # When the command pipe is closed, the browser removes its temporary files and
+                # exits. If the browser were killed at once, these files would remain.
                 browser.commands.close()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(5.0)
@@ -173,8 +173,8 @@ class _Browser:
         self.commands, self._answers = process.stdin, process.stdout
         self._rest = b""
         self._number = 0
-        # Session of the tab to which commands are sent. If it is empty, commands are sent to the
-        # browser itself, for example to create the tab.
+        # Session of the tab to which commands are sent. Before the tab exists, `_session` is empty,
+        # and commands are sent to the browser itself.
         self._session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
@@ -201,7 +201,7 @@ class _Browser:
         return result
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression; if it is a promise, wait for its result."""
+        """Return the value of a JavaScript expression; for a promise, wait for the result."""
         answer = self.tell(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )

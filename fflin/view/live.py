@@ -1,4 +1,4 @@
-"""Live viewer: a page in a browser of this machine, served by a thread of this process."""
+"""Live viewer: a page in a browser on this machine, served by a thread of this process."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ class Live:
             self.close()
 
     def close(self) -> None:
-        """Close the viewer; the page then reports the lost connection."""
+        """Close the viewer; the page in the browser reports the lost connection."""
         self._call(self._stop.set)
         self._thread.join(5.0)
 
@@ -192,7 +192,7 @@ class Live:
 
 
 def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
-    """Return {joint: range of its slider [rad|m|kg^0.5 m]} for all joints except wheels."""
+    """Return {joint: range of the slider [rad|m|kg^0.5 m]} for all joints except wheels."""
     found = {}
     for joint in robot.joints:
         most = 1.0 if joint.prismatic else np.pi

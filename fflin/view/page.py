@@ -1,7 +1,7 @@
 """Drawing of robots in a meshcat scene, and the self-contained HTML page of the scene.
 
-Each body has a node, whose child nodes are its visual elements. Wheels and thrusters are drawn at
-their positions on the links.
+Each body is a node of the scene. The visual elements of the body are child nodes of this node.
+Wheels and thrusters are drawn at their positions on the links.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ with warnings.catch_warnings():
 
 Lowered = dict[str, Any]
 
-# Wheels in the same frame would overlap. Therefore each of these wheels is moved along its axis by
-# this distance, relative to the robot's size.
+# Wheels in the same frame would overlap. Therefore each of these wheels is moved along its axis.
+# The distance is this fraction of the robot's size.
 _APART = 0.1
 
 # The axis of a cylinder is y in three.js, and z in URDF.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
-# {type of an array: its extension type of msgpack-lite, and the typed array that the page decodes}.
+# {type of an array: (extension type of msgpack-lite, name of the typed array in JavaScript)}.
 _TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
 
 # Placeholder for a mesh that has already been sent to the page.
@@ -108,7 +108,7 @@ class Drawing:
     """Drawing of a robot below a node of a page's scene, with a child node for each body.
 
     The constructor adds notes about missing drawings to `page.notes`. If `look` is "real" or
-    "held", it also adds the links of the robot to `page.links`.
+    "held", the constructor also adds the links of the robot to `page.links`.
     """
 
     def __init__(
@@ -134,8 +134,9 @@ class Drawing:
                     about["mesh"] = identity
                     page.sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
-                # A three.js mesh. The page replaces the material, which is a placeholder. If the
-                # geometry is the placeholder _ELSEWHERE, the page replaces it by an earlier mesh.
+                # `content` describes a three.js mesh. The material is a placeholder, which the page
+                # replaces. If the geometry is the placeholder _ELSEWHERE, the page uses the
+                # geometry that was sent earlier with the same `identity`.
                 content = {
                     "metadata": {"version": 4.5, "type": "Object"},
                     "geometries": [shown],
@@ -192,7 +193,7 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
     """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
     known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
     mass = known.mass if known else 0.0
-    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # its inertia is drawn
+    if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # an inertia box
         mass = robot.model.inertias[shape.joint].mass
     return [mass, *pin.SE3ToXYZQUAT(shape.at).round(6).tolist()]
 
@@ -269,7 +270,7 @@ def _box_corners(matrix: Array, box: Array) -> Array:
 
 
 class Recorder:
-    """Replacement for the window of a `meshcat.Visualizer`: records and forwards its commands."""
+    """Replacement for the window of a `meshcat.Visualizer`, to record and forward commands."""
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
@@ -326,7 +327,7 @@ def subtitle(robot: Robot) -> str:
 
 
 class Page:
-    """Page of a robot in a scene: its drawing, and the data that the scripts of the page read.
+    """Page that shows a robot in a scene: the drawing, and the data for the scripts of the page.
 
     The first frame shows the configuration `q` (nq,).
     """
@@ -337,12 +338,13 @@ class Page:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
         self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
         self.meshcat = Visualizer(window=self.window)
-        self.notes = dict[str, None]()  # about missing drawings
+        self.notes = dict[str, None]()  # notes about missing drawings
         self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
         self.drawing = Drawing(self, robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints (without the universe).
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
-        # For each thruster: its name, node, position and direction of its force.
+        # For each thruster: the name, the path of the body's node, and the position and direction
+        # of the force on this body.
         self.nozzles: list[dict[str, object]] = []
         for item, (name, *_) in robot.named_inputs:
             if isinstance(item, Thruster):
@@ -351,7 +353,8 @@ class Page:
                 nozzle["position"] = placement.act(np.array(item.position)).tolist()
                 nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
                 self.nozzles.append(nozzle)
-        # [m] Corners, centre and radius of the robot in the first frame, and the floor below it.
+        # In the first frame: corners of the bounding boxes of all bodies, centre and radius of the
+        # robot, and the point of the floor below the centre. All are in m.
         self.points = self.drawing.points(body_poses(robot, q))
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         self.centre = (low + high) / 2.0
@@ -384,7 +387,8 @@ class Page:
             axis, several = np.array(wheel.axis), [each.frame for _, each in named]
             apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
-            # A wheel whose speed is a state is drawn with the rotation of its joint's node.
+            # If the speed of a wheel is a state, the drawn wheel rotates with the node of the
+            # wheel's joint.
             spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         # A live page receives the meshcat commands from the server. Other pages contain these

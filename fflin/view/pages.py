@@ -31,18 +31,18 @@ from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
 
-# Number of poses in a period, and the duration of a period on the screen [s]. The amplitude is
-# chosen such that no rotation exceeds _ANGLE [rad], and no displacement exceeds _SHARE times the
-# robot's size.
+# A mode is animated with _PHASES poses per period. A period takes _PERIOD [s] on the screen. The
+# amplitude is chosen such that no rotation exceeds _ANGLE [rad], and no displacement exceeds _SHARE
+# times the robot's size.
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-# Relative to the robot's size: ARROW is the length of the arrow that represents the largest force.
-# If the motion extends over more than _FAR, the camera follows the base by default.
+# ARROW is the length of the arrow for the largest force. If the motion extends over more than _FAR,
+# the camera follows the base by default. Both lengths are relative to the robot's size.
 ARROW, _FAR = 0.62, 20.0
 
-# The flight of a payload before its capture is integrated in steps. _STEP is the longest step [s].
-# _SWING is the largest phase [rad] of the payload's fastest oscillation in a step.
+# The flight of a payload before its capture is integrated in steps of at most _STEP [s]. Within a
+# step, the phase of the payload's fastest oscillation changes by at most _SWING [rad].
 _STEP, _SWING = 0.05, 0.3
 
 # Largest number of frames. More frames would enlarge the file without a visible effect.
@@ -66,7 +66,7 @@ def motion_page(
     frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:  # none, one, or one for each frame
+    if target is None:  # `states` has no row, one row for a fixed target, or one per frame
         states = motion.target.reshape(-1, state.nx)
         states = states[shown] if len(states) > 1 else states
         goal = state.points(states)[1]
@@ -96,7 +96,7 @@ def motion_page(
         {"type": "set_animation", "animations": clips, "options": options, "path": ""}
     )
 
-    # The robot of each phase, if known. After a capture, it includes the payload.
+    # Robot of each phase, if known. In the phases after a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [each.name.replace("+", " + ") for each in flown]
@@ -142,8 +142,8 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the data of the trails, force arrows and thruster plumes of a page.
 
-    `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and its
-    trails are included.
+    `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and the
+    trails of the target are included.
     """
     trails, followed = {"centre of mass": film.com}, dict[str, Array]()
     if len(goals) > 1:
@@ -179,7 +179,7 @@ class Playback(NamedTuple):
     """Poses, trails and forces of a motion at N frames."""
 
     poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
-    com: Array  # (N, 3) [m]
+    com: Array  # (N, 3) [m] centre of mass in the world
     force: Array  # (N, 3) [N] on the base, in world axes
     torque: Array  # (N, 3) [N m] on the base, in world axes
     thrust: Array  # (N, k) [N] of k thrusters
@@ -216,7 +216,10 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
 
 
 def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
-    """Yield each capture, and poses (N, njoints - 1, 7) of its payload at the samples `shown`."""
+    """Yield each capture, and the poses (N, njoints - 1, 7) of the captured payload.
+
+    The poses are at the samples of the motion whose indices are in `shown` (N,).
+    """
     parts = motion._phases
     first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
     for k, caught in enumerate(parts):
@@ -240,7 +243,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
-    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of its frequencies
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of frequencies
     for time in t[::-1].tolist():
         steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
@@ -286,8 +289,8 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
     """Return the readouts and plots of a motion at the samples `shown`.
 
-    Errors are relative to the target (k, nq). If k = 0, changes from the first configuration are
-    shown.
+    Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
+    from the first configuration instead of errors.
     """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
@@ -298,7 +301,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
-    if len(motion.com_drift):  # it may be missing in a file
+    if len(motion.com_drift):  # empty in orbit, and in some files
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     for title, whole in charts(motion).items():
         lines = []
@@ -325,7 +328,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 
 
 def _size(curve: Curve) -> float:
-    """Return the largest magnitude of a curve and its reference."""
+    """Return the largest magnitude of a curve and, if it has a reference, of the reference."""
     rows = curve.values if curve.reference is None else (*curve.values, *curve.reference)
     return float(np.abs(rows).max())
 
@@ -412,10 +415,10 @@ def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
 
 
 def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
-    """Return the name, unit, amplitude and phase [deg] of up to eight positions of a mode.
+    """Return the name, unit, amplitude and phase [deg] of up to eight states of a mode.
 
-    They are the positions with the largest amplitudes. The largest amplitude is 1, and amplitudes
-    of 0.01 or less are omitted.
+    They are the position states with the largest amplitudes. The largest amplitude is 1. States
+    with an amplitude of 0.01 or less are omitted.
     """
     sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
     order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()

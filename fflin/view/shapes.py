@@ -39,13 +39,13 @@ class Shape:
 
     joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
-    size: tuple[float, ...]  # side lengths; radius; radius and length [m]; or a mesh's scale
+    size: tuple[float, ...]  # [m] sides, radius, or radius and length; scale of a mesh
     placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
     color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
-    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # of the link in the joint's frame
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's placement on the joint
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -71,8 +71,8 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
 def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
     """Return where the base and the joints of an attached payload are on the robot.
 
-    Each entry is the robot's joint that carries a frame of the payload, and the placement of the
-    frame on this joint.
+    Each entry belongs to the base or to a joint of the payload. It contains the joint of the robot
+    that carries this frame of the payload, and the placement of the frame on that joint.
     """
     names = [f"{prefix}.{name}" for name in list(payload.model.names)[ROOT + 1 :]]
     return [find_frame(robot.model, prefix), *(find_joint(robot.model, name) for name in names)]
@@ -195,11 +195,11 @@ class Bending(NamedTuple):
     """
 
     node: int  # Pinocchio joint of the first mode; its scene node carries the links
-    carrier: int  # Pinocchio joint
-    frame: pin.SE3  # placement on the carrier
-    modes: list[int]  # indices in q
+    carrier: int  # Pinocchio joint that carries the appendage
+    frame: pin.SE3  # placement of the appendage's frame on the carrier
+    modes: list[int]  # indices of the modal amplitudes in q
     twist: Array  # (6, k) per unit of q: translation before rotation
-    center: Array  # (3,) position in the frame of a ball that represents the links
+    center: Array  # (3,) centre, in `frame`, of a ball that represents the links
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement, in the world, of the appendage's frame after bending."""
@@ -279,8 +279,9 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 # triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles of a mesh file. The grid is made coarser until the file has at most
-# this number, or until the cells are larger than 2 % of the largest extent of the meshes.
+# Largest number of triangles that are drawn for a mesh file. Vertices in the same cell of a grid
+# are merged. The grid is made coarser until at most this number of triangles remain, or until the
+# cells are larger than 2 % of the largest extent of the file's meshes.
 _LARGEST = 20_000
 
 
@@ -294,7 +295,10 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length; raise ValueError if it cannot be drawn."""
+    """Read a mesh file; raise ValueError if it cannot be drawn.
+
+    The vertices are in the file's unit of length. For a COLLADA file, they are in m.
+    """
     try:
         found = os.stat(path)
     except OSError as error:
@@ -337,7 +341,7 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
         found = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
             color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
-            if color is not None:  # None stands for a texture, or nothing
+            if color is not None:  # None if the file gives a texture or no colour
                 r, g, b, a = (float(x) / 255.0 for x in color)
                 color = r, g, b, a or 1.0
             found.append((mesh.vertices, mesh.faces, color))
@@ -367,7 +371,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # After the merge, several triangles may be equal; keep only one of them.
+    # After the merge, several triangles may have the same corners; keep only one of them.
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)

@@ -228,7 +228,7 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
-    """Return the tool frame; the default is "tool", or else the end of the longest chain."""
+    """Return the tool frame: by default "tool" if it exists, else the end of the longest chain."""
     if tool is not None:
         find_frame(robot.model, tool)
         return tool
@@ -270,7 +270,8 @@ def check_playback(
 def _robot_of(robot: Robot, motion: Motion) -> Robot:
     """Return the robot that a motion was simulated with.
 
-    In a run of a campaign, it may be a perturbed robot instead of the given nominal robot.
+    `robot` is the nominal robot. If the motion is a run of a campaign, return the perturbed robot
+    of this run.
     """
     from fflin.simulation.motion import require_motion
 
@@ -301,8 +302,8 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # A motion that settles is fastest at the beginning, so its pictures are closer together
-        # there. A tracking motion never settles, so its pictures are evenly spaced.
+        # Most motions settle, and are fastest at the beginning, so the pictures are close together
+        # there. If the motion tracks a moving target, the pictures are evenly spaced.
         fractions = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
         times = [start + fraction * (end - start) for fraction in fractions]
     contents = {}
