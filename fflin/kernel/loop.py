@@ -36,13 +36,13 @@ class Wheels(
 class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
     """Pulsed thrusters (k,): one pulse per sample delivers the commanded impulse.
 
-    - `at`: index of the thruster's input. `on_off`: True if the thrust can only be 0 or `most`,
-      False if it can have any value between them.
+    - `at`: index of the thruster's input. `on_off`: True if the thrust is either 0 or `most`, False
+      if the thrust can have any value from 0 to `most`.
     - `most` [N]: largest thrust. `least` [N s]: least impulse of a pulse.
     - `quantum` [N s]: the impulse of an on-off thruster in one step; unused for other thrusters.
-    - `left` [N s]: the commanded impulse that was not fired; it is added to the impulse that the
-      next sample commands.
-    - `level` [N]: the thrust of the latest pulse. `end`: the first step after this pulse.
+    - `left` [N s]: the commanded impulse that was not fired. It is added to the commanded impulse
+      of the next sample.
+    - `level` [N]: the thrust of the latest pulse. `end`: the first step after the latest pulse.
     - `time` [s]: the sample time.
     """
 
@@ -53,11 +53,11 @@ class Channel(
     """Channel from commands (nu,) to inputs: limits, sample and hold, delay, wheels and pulses.
 
     - `low`, `high` (nu,): limits of the commands.
-    - `held` (nu,): the command that acts now. `pending` (slots, nu): the commands of the latest
-      samples, including those that have not arrived yet because of the delay.
+    - `held` (nu,): the latest command that has arrived. `pending` (slots, nu): the commands of the
+      latest samples. Some of these commands may not have arrived yet, because of the delay.
     - `sample`: number of steps per sample, 0 for continuous commands. `delay` (1,): delay in steps.
     - `fresh` (1,): 1 in a step in which a command arrives, else 0. Until the first command
-      arrives, it is 1 at the start of each sample, so that the initial inputs are pulsed too.
+      arrives, `fresh` is 1 at the start of each sample, so that the initial inputs are pulsed too.
     """
 
 
@@ -86,7 +86,7 @@ def is_asked(channel, step):
 
 
 def transmit(channel, step, nu, u):
-    """Replace the command u by the inputs that act in this step.
+    """Replace the command u by the inputs that act in a step.
 
     The command is read only in steps in which the policy is evaluated (`is_asked`). nu contains the
     wheel speeds, at the indices `Wheels.row`.
@@ -97,7 +97,7 @@ def transmit(channel, step, nu, u):
         if channel.sample > 0:
             first = (step // channel.sample) % channel.slots * count
             vec.copy(u, 0, channel.pending, first, count)
-    # Write the latest command that has arrived. For a pulsed thruster, write its present thrust.
+    # Write the latest command that has arrived. For a pulsed thruster, write the present thrust.
     if channel.sample > 0:
         any_fresh = False
         for lane in range(vec.lane_count(channel.delay)):
@@ -118,9 +118,9 @@ def transmit(channel, step, nu, u):
         for index in range(len(pulses.at)):
             level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
             store(u, pulses.at[index], level)
-    # If a torque would make a wheel exceed its speed limit in this step, reduce the magnitude of
-    # the torque, if necessary to zero. The torque is not reversed, even if the wheel already
-    # exceeds its speed limit.
+    # Reduce the torque of a wheel so far that the wheel does not exceed a speed limit in this step.
+    # If the wheel already exceeds a speed limit, the torque is at most reduced to zero, and is not
+    # reversed.
     wheels = channel.wheels
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
@@ -170,11 +170,11 @@ class Method(
       s - 1, then by row s.
     - `speed` (s, 1 + s): nu after stage i is the sum of the rows of `rates` with the weights in row
       i of `speed`.
-    - `origin` (s,): 0 if the displacement after a stage starts at q of the first stage, 1 if it
-      starts at q of the second stage.
+    - `origin` (s,): one entry for the displacement after each stage. 0: the displacement starts at
+      q of the first stage. 1: the displacement starts at q of the second stage.
     - `nodes` (s,) [s]: times of the stages, measured from the start of the step.
-    - `weights` (s,) [s]: weights of the stages in a time integral over the step; they contain the
-      factor h. `moments` (s,) [s^2]: weights in a double integral; they contain the factor h^2.
+    - `weights` (s,) [s]: weights of the stages in a time integral over the step, times h. `moments`
+      (s,) [s^2]: weights of the stages in a double time integral over the step, times h^2.
     - `along`: work space for a displacement. `first`, `second`: work space for q at the first and
       at the second stage.
     - `u` (nu,): inputs at the start of the latest step.
@@ -184,8 +184,8 @@ class Method(
 class StopConditions(namedtuple("StopConditions", "squares sign")):
     """Stop conditions: limits of the velocity and of the attitude.
 
-    - `squares` (6 + n,): squared limits of the entries of nu. In the Python engine, they are the
-      squared limits of the entries of v (nv,).
+    - `squares`: squared limits of the entries of nu (6 + n,). In the Python engine, `squares`
+      contains the squared limits of the entries of v (nv,).
     - `sign` (1,): the sign that q0 must keep, where q0 is the scalar part of the quaternion from
       the reference to the base. If the policy uses no chart, the sign is 0, and every attitude is
       allowed.
@@ -197,10 +197,10 @@ class Arguments(
 ):
     """Arguments of `advance`.
 
-    If `project` is true, each step ends with a correction of the base's position and velocity, so
-    that momentum and centre of mass match the momentum reference (`forward.impose`). If `pushed` is
-    true, external wrenches act, and their integrals are added to this reference
-    (`forward.add_wrench`).
+    If `project` is true, `forward.impose` corrects the base's position and velocity at the end of
+    each step. After the correction, momentum and centre of mass match the momentum reference. If
+    `pushed` is true, external wrenches act on the robot, and `forward.add_wrench` adds the
+    integrals of the wrenches to the momentum reference.
     """
 
 
@@ -253,7 +253,7 @@ def goes_on(stop, origin, q, rates):
 def _move(robot, method, point, stage):
     """Move the point from a stage to the next stage, or from the last stage to the step's end.
 
-    The accelerations up to this stage must be in `method.rates`.
+    `method.rates` must contain the accelerations of all stages up to the stage `stage`.
     """
     rates, along = method.rates, method.along
     if stage == 1:
@@ -268,7 +268,7 @@ def _move(robot, method, point, stage):
 
 
 def advance(words, clock, last, every, rows, work):
-    """Advance eight runs to the step `last`, or until one of them meets a stop condition.
+    """Advance eight runs to the step `last`, or until one of the runs meets a stop condition.
 
     `words` are the 64-bit words of `Arguments`, see `kernel.tree`. The function updates the point,
     the momentum reference, the state of the policy and the state of the channel. clock (1,) is the
@@ -332,8 +332,10 @@ class RunStatistics(
 ):
     """Statistics of the errors of eight runs, and the reference from which errors are measured.
 
-    - `x_ref` (nx,): the reference state. `path.point.q` contains its attitude as a quaternion.
-    - `q_ref`, `nu_ref`: q and nu of a moving reference, one row per step; else empty.
+    - `x_ref` (nx,): the reference state. `path.point.q` contains the attitude of the reference as
+      a quaternion.
+    - `q_ref`, `nu_ref`: q and nu of a moving reference, one row per step. Both are empty if the
+      reference does not move.
     - `law`: the `Law` with which `read_state` computes states.
     - `kind` (nx,): the states are grouped into kinds; the joint positions, for example, are one
       kind. Each entry is the index of the kind of one state. The index 0 is for the attitude, and
@@ -396,7 +398,7 @@ def _compare(stats, step):
 def take(words, rows, first, count):
     """Update the statistics with rows of `advance`, one row for each of `count` steps.
 
-    `first` is the first of these steps. `words` are the 64-bit words of `RunStatistics`.
+    `first` is the index of the first step. `words` are the 64-bit words of `RunStatistics`.
     """
     stats = RUN_STATISTICS(words)
     at, sizes, kept = stats.at, stats.sizes, 0
@@ -411,8 +413,9 @@ def take(words, rows, first, count):
         for kind in range(len(sizes)):
             value = load(sizes, kind)
             _grow(stats.largest, kind, value)
-            # If the error is a new maximum above the tolerance, it exceeds the bound for settling,
-            # which is only a fraction of this maximum. So the settling time starts anew.
+            # The bound for settling is a fraction of the largest error so far, or the tolerance if
+            # the tolerance is larger. So a new largest error above the tolerance exceeds the bound,
+            # and the settling time starts anew.
             bound = stats.settled * load(stats.largest, kind)
             bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
             store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))

@@ -1,11 +1,11 @@
-"""Compilation of the kernel's functions, and of the functions that they call, by numba.
+"""Compilation of the kernel's functions by numba.
 
 `translated` converts a function of the kernel to a numba function. By default, numba generates
-machine code for each function together with all functions that it calls. A function at the end of a
-chain of ten calls would be compiled ten times. This module avoids the repetition: a *part* is a
-function that is called only by compiled functions, and numba keeps it as LLVM code (LLVM's
-intermediate representation). Machine code is generated only for a function that Python calls,
-together with all parts that it needs.
+machine code for each function together with all called functions. A function at the end of a chain
+of ten calls would be compiled ten times. This module avoids the repetition. A *part* is a function
+that only compiled functions call. For a part, numba generates only LLVM code (LLVM's intermediate
+representation). For a function that Python calls, numba generates machine code from the LLVM code
+of the function and of all needed parts.
 
 The operations of `kernel.vectors` are compiled for one number or for eight numbers. An array with
 one axis holds numbers. An array with a second axis of length eight holds lanes: each lane is one
@@ -109,10 +109,10 @@ _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Return a decorator for a code generator; its code replaces a function of `vectors`.
+    """Return a decorator for the code generator that replaces a function of `vectors`.
 
     If the first argument of the replaced function is an array, the generator receives the address
-    of the array's first entry instead. This entry is a double or a vector of eight doubles.
+    of the array's first entry. The entry is a double or a vector of eight doubles.
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:
@@ -205,7 +205,7 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
 
 
 class _NoEnvironments:
-    """numba code generator for parts; unlike numba's own, it sets no environment.
+    """numba code generator for parts, which does not set the environment of a function.
 
     An environment is the run-time data of a numba function. numba would store the address of the
     environment in the function's machine code, but a part has no machine code.
@@ -222,7 +222,7 @@ class _NoEnvironments:
 
 
 class PartLibrary(CPUCodeLibrary):
-    """numba library with the LLVM code of a part, and references to the parts that it calls."""
+    """numba library with the LLVM code of a part, and references to all called parts."""
 
     _whole: ir.Module | None = None
 
@@ -232,12 +232,12 @@ class PartLibrary(CPUCodeLibrary):
         return _NoEnvironments(self._codegen)
 
     def finalize(self) -> None:
-        """Mark the library as complete, but do not optimise its code."""
+        """Mark the library as complete, but do not optimise the LLVM code."""
         self._raise_if_finalized()
         self._finalized = True
 
     def add_linking_library(self, library: CodeLibrary) -> None:
-        """Record a library whose functions this part calls."""
+        """Record a library with functions that this part calls."""
         super().add_linking_library(library)
         self._reload_init.update(library._reload_init)
 
@@ -247,9 +247,9 @@ class PartLibrary(CPUCodeLibrary):
         return 0
 
     def _called(self, found: dict[CodeLibrary, ir.Module]) -> None:
-        """Add to `found` the LLVM code of all functions that this part calls.
+        """Add to the dict `found` the LLVM code of all functions that this part calls.
 
-        Functions that are called indirectly are included. Each function is added once.
+        Indirectly called functions are included. Each function is added once.
         """
         for library in self._linking_libraries:
             if library not in found:
@@ -260,7 +260,7 @@ class PartLibrary(CPUCodeLibrary):
                     library._called(found)
 
     def _get_module_for_linking(self) -> ir.Module:
-        """Return the LLVM code of this part together with one copy of each part that it calls."""
+        """Return the LLVM code of this part together with one copy of each called function."""
         if self._whole is None:
             found = {self: super()._get_module_for_linking()}
             self._called(found)
@@ -283,7 +283,7 @@ class PartCompiler(Compiler):
 
 
 class _StructType(Type):
-    """numba type of a struct: a pointer to its 64-bit words; see `kernel.tree`."""
+    """numba type of a struct: a pointer to the 64-bit words of the struct; see `kernel.tree`."""
 
     def __init__(self, struct: Struct[NamedTuple]) -> None:
         self.struct = struct
@@ -291,7 +291,7 @@ class _StructType(Type):
 
 
 def _numba_type(kind: Kind | Struct[NamedTuple]) -> Type:
-    """Return the numba type of a field of this kind."""
+    """Return the numba type of a field of the given kind."""
     if isinstance(kind, Struct):
         return _StructType(kind)
     number = numba.from_dtype(np.dtype(kind.dtype))
@@ -359,10 +359,10 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
     return extending.intrinsic(opened)
 
 
-# "contract": a product and a sum may become one fused instruction, which rounds once. "numpy": a
-# division by zero gives infinity or NaN, and no error. "_nrt": reference counting of arrays is off,
-# because it would take three quarters of the running time. Without reference counting, kernel
-# functions cannot allocate arrays.
+# Options of numba. "contract": a product and a sum may become one fused instruction, which rounds
+# once. "numpy": a division by zero gives infinity or NaN, and no error. "_nrt": reference counting
+# of arrays would take three quarters of the running time, so it is off. Without reference counting,
+# kernel functions cannot allocate arrays.
 _OPTIONS: dict[str, object] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 _PART: dict[str, object] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
@@ -388,7 +388,7 @@ def translated(function: FunctionType, how: str = "") -> Compiled:
     """Return a function of the kernel as a numba function that calls only numba functions.
 
     By default, the function becomes a part. For a function that Python calls, `how` must be
-    "compiled"; the machine code is then stored on disk.
+    "compiled", and numba stores the machine code on disk.
     """
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:

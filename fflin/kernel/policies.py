@@ -30,10 +30,10 @@ class Path(
       of `speed` give nu. The variable of both cubics is the elapsed fraction of the interval.
     - `hold`: if true, u is constant between knots, else linear. u is evaluated `ahead` [s] after
       the current time.
-    - `held`: for each vector of three inputs in world axes, the index of its first input.
-    - `K`: the gain is a polynomial in time on each of several intervals, which begin at the times
-      `starts` (m,) [s]. `K` contains the coefficients (m, `order`, nu, nx). The variable of a
-      polynomial is the time since the start of its interval. From `last` [s] after the start of the
+    - `held`: for each torque or force in world axes, the index of the first of the three inputs.
+    - `K`: coefficients (m, `order`, nu, nx) of the gain. The gain is a polynomial in time on each
+      of m intervals, which begin at the times `starts` (m,) [s]. The variable of each polynomial is
+      the time since the start of the interval. From the time `last` [s] after the start of the
       trajectory, the gain is constant.
     - `ends`: True if the trajectory ends before the run. In this case, `q`, `u`, `speed` and `K`
       have one further row, which applies after the time `over` [s] of the run.
@@ -62,7 +62,7 @@ def _latest(knots, time):
 def _placed(knots, time):
     """Return the index of the knot interval that contains a time, and the elapsed fraction.
 
-    The fraction is 0 at the first knot of the interval, and 1 at its last knot.
+    The fraction is 0 at the start of the interval, and 1 at the end.
     """
     last = len(knots) - 2
     k = min(_latest(knots, time), last)
@@ -73,10 +73,11 @@ def _placed(knots, time):
 
 
 def error(robot, path, point):
-    """Write the error (5.1) of `point` relative to the followed point into `path.e`.
+    """Write the error (5.1) of a point of the robot relative to the followed point to `path.e`.
 
-    The followed point is `path.point`. The position error is in the axes of its base. The velocity
-    error is the nu of `point` minus the nu of the followed point, each in the axes of its own base.
+    The followed point is `path.point`. The position error is in the axes of the base at the
+    followed point. The velocity error is the robot's nu minus nu of the followed point. Each nu is
+    in base axes: of the robot's base, or of the base at the followed point.
     """
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
@@ -158,17 +159,18 @@ class Law(
       `path`.
     - `x`: the state (nx,), followed by the three outputs of each gyroscope.
     - `gyros` (k,): the index of the body that carries each gyroscope. `gyro_axes` (9 k,): the three
-      axes of each gyroscope, in the axes of its body.
+      axes of each gyroscope, in the axes of that body.
     - `y` (ny,): the outputs, which are the entries `measured` of x plus noise. The noise of each
       sample is one row of `added` (slots, ny). After the last row, the first row is used again.
-    - `turned` (2,): for omega_b and for v_b, True if the state contains this velocity in reference
-      axes, False if in base axes.
+    - `turned` (2,): one entry for omega_b and one for v_b. True: the state contains the velocity in
+      reference axes. False: the state contains the velocity in base axes.
     - `origin` (rows, 7): pose of the world frame relative to the reference, which is the pose of
       the base at which q_b and r_b are 0.
     - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint
       differs from the position of the joint in `near` by at most pi.
     - `origin` and `near` have one row per sample. The last row also applies to all later samples.
-    - `u`: the command. If `allocation` has inputs, the command is distributed to these inputs.
+    - `u`: the command. If `allocation` has inputs, the command is distributed to the inputs of
+      `allocation`.
     """
 
 
@@ -244,7 +246,7 @@ def command(work, robot, law, point, t, count, stage):
         return
     row = min(count, len(law.origin) // 7 - 1)
     read_state(robot, law, point, row)
-    # Compute the outputs y, including the noise of this sample.
+    # Compute the outputs y, with the noise of the sample.
     outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
     if len(gyros) > 0:
         move_bodies(work, tree, point.nu)
@@ -281,7 +283,7 @@ def _feed_back_between(robot, law, point):
 
 
 def _corner(grid, corner, lane):
-    """Return the weight of a grid corner in the interpolation, and the index of its gain in `K`.
+    """Return a grid corner's weight in the interpolation, and the corner's index in `grid.K`.
 
     The corner belongs to the grid cell that contains the joint positions of the lane. Bit i of
     `corner` is 1 if the corner is at the upper grid value of joint i, and 0 if it is at the lower
@@ -303,7 +305,10 @@ def _corner(grid, corner, lane):
 
 @called
 def _filter(by, y, u, row, stage):
-    """Write the command of the linear controller `by`, and its next z or dz/dt; see `Filter`."""
+    """Write the command u of a linear controller, and the controller's next z or dz/dt.
+
+    `by` is the linear controller, a `Filter`.
+    """
     size, outputs, inputs = len(by.z), len(y), len(u)
     along = len(by.rates) > size
     first = (1 + stage) * size if along else 0

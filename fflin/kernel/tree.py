@@ -1,10 +1,11 @@
 """Arguments of the kernel: named tuples of arrays, such as the kinematic tree of a robot.
 
-numba compiles a function again for each new set of argument types, and passes a named tuple as
-many separate arrays. To avoid both, `kernel.loop` receives its named tuples as one array of 64-bit
-words. In compiled code, a `Struct` is a pointer into this array, and each field is read when it is
-used. So the argument types are always the same, and a call within compiled code passes one pointer.
-The words must not change during a call.
+numba compiles a function again for each new set of argument types, and passes a named tuple as many
+separate arrays. To avoid repeated compilation and many arguments, the functions of `kernel.loop`
+receive one array of 64-bit words in place of a named tuple. In compiled code, a `Struct` is a
+pointer into the array of words. Each use of a field reads the field from the array. So the argument
+types are always the same, and a call within compiled code passes one pointer. The words must not
+change during a call.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ def address_of(array: NDArray[np.generic]) -> int:
 def work_space(size: int) -> Array:
     """Return an uninitialised array (size, LANES)."""
     space = np.empty((size + 1) * LANES)
-    # The eight doubles of an entry have 64 bytes. Access is faster if they are aligned to 64 bytes.
+    # An entry consists of eight doubles, which have 64 bytes. Access is faster if the address of
+    # each entry is a multiple of 64 bytes.
     first = -(address_of(space) // 8) % LANES
     return space[first : first + size * LANES].reshape(size, LANES)
 
@@ -58,11 +60,11 @@ T = TypeVar("T", bound=NamedTuple)
 
 
 class Struct(Generic[T_co]):
-    """Kinds of the fields of a named tuple of kernel arguments.
+    """Kind of each field in a named tuple of kernel arguments.
 
-    `made` is the class of the named tuple. `others` maps the name of a field to its kind. `groups`
-    maps a kind to the names of the fields of this kind, separated by spaces. All other fields are
-    of the kind `rest`.
+    `made` is the class of the named tuple. The keyword arguments `others` are {field: kind}. The
+    entries of `groups` are {kind: names of fields, separated by spaces}. All other fields have the
+    kind `rest`.
     """
 
     def __init__(
@@ -90,7 +92,7 @@ class Struct(Generic[T_co]):
 
 @cache
 def empty(kind: Struct[T]) -> T:
-    """Return a named tuple of this struct with empty arrays and with 0 for each number."""
+    """Return a named tuple with the fields of a struct: empty arrays, and 0 for each number."""
     parts: list[object] = []
     for of in kind.kinds.values():
         if isinstance(of, Struct):
@@ -101,21 +103,22 @@ def empty(kind: Struct[T]) -> T:
 
 
 def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tuple[Array, Array]]]:
-    """Convert the fields of a named tuple to the kinds of its struct.
+    """Convert the fields of a named tuple to the kinds that the struct `kind` requires.
 
-    Return the converted tuple, its words, and one pair for each array with lanes. A pair consists
-    of the array and of the column of values with which all its lanes are filled. The words contain
-    the addresses of the converted arrays, so the converted tuple must exist as long as the words
-    are used.
+    Return the converted tuple, the words of the tuple, and one pair for each array with lanes. A
+    pair consists of the array, and of the column of values that every lane contains at first. The
+    words contain the addresses of the converted arrays. So the converted tuple must exist as long
+    as the words are used.
     """
     words, fresh = list[int](), list[tuple[Array, Array]]()
     return _lay_out(value, kind, words, fresh), np.array(words, dtype=np.int64), fresh
 
 
 def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]) -> T:
-    """Return the converted tuple of `laid_out`; append to its lists `words` and `fresh`.
+    """Return the converted tuple of `laid_out`, and append to the lists `words` and `fresh`.
 
-    `words` receives the words of the tuple, `fresh` one pair for each array with lanes.
+    The words of the tuple are appended to `words`. One pair for each array with lanes is appended
+    to `fresh`.
     """
     parts: list[object] = []
     for part, of in zip(value, kind.kinds.values(), strict=True):
@@ -141,8 +144,8 @@ def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Arra
 # the parent's origin. INERTIA is the number of entries of a body's inertia: m, m c, and I as xx xy
 # xz yy yz zz.
 PLACE, INERTIA = 12, 10
-# MOTION is the number of entries for the motion of a body, and LOAD is the number of entries for
-# the forces and momenta of its subtree. `kernel.bodies` has the offsets of these entries.
+# MOTION is the number of entries for a body's motion. LOAD is the number of entries for the forces
+# and momenta of the body's subtree. The offsets of the entries are in `kernel.bodies`.
 MOTION, LOAD = 30, 27
 
 
@@ -155,47 +158,49 @@ class Tree(
         "bias c columns lower held size",
     )
 ):
-    """Kinematic tree of a robot, with its inputs, stored momenta, springs and dampers.
+    """Kinematic tree of a robot, with inputs, stored momenta, springs and dampers.
 
     Body 0 is the base, which has the coordinates 0 to 5. Every other body has one joint, which
-    connects it to its parent. Bodies are in Pinocchio's order, and coordinates are in the order of
-    nu. In the compiled code of `kernel.loop`, the fields `fixed`, `bodies`, `wrench`, `stored`,
-    `stiffness` and `damping` have one column per lane.
+    connects the body to its parent. Bodies are in Pinocchio's order, and coordinates are in the
+    order of nu. In the compiled code of `kernel.loop`, the fields `fixed`, `bodies`, `wrench`,
+    `stored`, `stiffness` and `damping` have one column per lane.
 
     Fields with one value or row per body:
 
     - `parent`: index of the parent body.
-    - `fixed` (12): pose of the joint frame relative to the parent's joint frame, for the joint
-      position zero: the three columns of the rotation, then the origin. z is along the joint axis.
-    - `index`: index of the joint position in q. `unbounded`: True if q contains the cosine and the
-      sine of the joint angle at this index and the next one, instead of the joint position.
+    - `fixed` (12): pose of the joint frame relative to the parent's joint frame, if the joint
+      position is zero. The pose consists of the three columns of the rotation, and of the origin.
+      The z axis of the joint frame is along the joint axis.
+    - `index`: index of the joint position in q. `unbounded`: False if q contains the joint position
+      at `index`. True if q contains the cosine of the joint angle at `index`, and the sine at
+      `index` + 1.
     - `turns`, `slides`: rotation about z and translation along z per unit of the joint position.
     - `bodies` (10): the mass m, the first moment m c with the centre of mass c, and the inertia
       about the joint's origin as xx xy xz yy yz zz.
     - `axes` (3, 3): rotation from the joint frame to Pinocchio's joint frame.
-    - `coordinate`: the coordinate that moves the joint. `factor`: the joint motion per unit of this
+    - `coordinate`: the coordinate that moves the joint. `factor`: the joint motion per unit of the
       coordinate.
 
     Fields for M, whose rows are packed as in `kernel.bodies`:
 
     - `armature` (6 + n,): the inertia of rotors, which is added to the diagonal of M.
-    - `row`, `depth` (6 + n,): the offset of each row, and the number of its entries before the
-      diagonal.
+    - `row` (6 + n,): the offset of each row. `depth` (6 + n,): the number of entries before the
+      diagonal in each row.
     - `path`: the column of each entry.
-    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that are in both rows.
+    - `common` (6 + n, 6 + n): for each pair of rows, the number of columns that both rows have.
     - `target`, `share`: the contributions of the bodies to M, from the last body to the first. A
-      body forms a pair with itself, and with each body between it and the base. For each pair,
-      `target` is the index of the entry of M to which the pair contributes, and `share` is the
-      factor of the contribution. The pairs of a body are followed by one value for the six entries
-      that couple the coordinate of the body to the base: `target` is the index of the first entry,
-      and `share` is the factor of all six.
+      body forms a pair with itself, and with each body on the path to the base. Each pair
+      contributes to one entry of M: `target` is the index of the entry, and `share` is the factor
+      of the contribution. After the pairs of each body, both fields have one further value for the
+      six entries of M that couple the body's coordinate to the base. Here `target` is the index of
+      the first entry, and `share` is the factor of all six entries.
 
     Fields for the forces:
 
     - `driven`: the coordinate that each input drives, -1 for a body-fixed wrench.
-    - `wrench_body`, `wrench`, `input`: for each body-fixed input, its body, its unit wrench at the
-      body's joint, and its index among all inputs.
-    - `stored_body`, `stored`: the bodies with a stored momentum, and these momenta in joint axes.
+    - `wrench_body`: the body of each body-fixed input. `wrench`: the wrench per unit of the input,
+      at the body's joint. `input`: the index of the body-fixed input among all inputs.
+    - `stored_body`: the bodies with a stored momentum. `stored`: the stored momenta in joint axes.
     - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
     `size` is the size of the work space. The other fields are offsets in the work space.
@@ -327,9 +332,9 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     """Return the columns of the nonzero entries in each row of L (M = L^T D L), diagonal last."""
-    # With mimic joints, one coordinate moves several bodies, whose ancestors may be on different
-    # branches. The factorisation fills in entries, so that the coordinates of all these ancestors
-    # are on one path (Liu's elimination tree).
+    # With mimic joints, one coordinate moves several bodies. The ancestors of these bodies may be
+    # on different branches. The factorisation of M makes further entries nonzero. So the
+    # coordinates of all ancestors must be on one path, as in Liu's elimination tree.
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body
@@ -344,7 +349,8 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
         if reached[index]:
             nearest = max(reached[index])
             reached[nearest] |= reached[index] - {nearest}
-    # Each row stores the whole path to the base, because the rows of L^-1 are full along this path.
+    # Each row has an entry for every coordinate on the path to the base, because all entries of
+    # L^-1 on the path may be nonzero.
     for index in range(size):
         paths[index] = [*(paths[max(reached[index])] if reached[index] else ()), index]
     return paths

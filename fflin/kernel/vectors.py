@@ -1,10 +1,10 @@
 """Operations on numbers, vectors (3), spatial vectors, attitudes and displacements.
 
-All functions of the kernel are written in Python. The Python engine calls some of them directly,
-with arrays or lists that have one axis. A function then computes one number at a time, and a
-debugger can step through it. `kernel.machine_code` compiles the same functions, also for arrays
-with a second axis of eight lanes. In compiled code, other operations replace `load`, `store`,
-`chosen`, `below`, `floor`, `whole`, `root` and `angle`.
+All functions of the kernel are written in Python. The Python engine calls some of these functions
+directly, with arrays or lists that have one axis. In the Python engine, a function computes one
+number at a time, and a debugger can step through the function. `kernel.machine_code` compiles the
+same functions, also for arrays with a second axis of eight lanes. In compiled code, other
+operations replace `load`, `store`, `chosen`, `below`, `floor`, `whole`, `root` and `angle`.
 
 A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force). A
 displacement has the order of the state: first the base's rotation and translation in base axes,
@@ -39,7 +39,7 @@ IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Mark a rarely called function, so that numba does not inline it; this saves compile time."""
+    """Mark a rarely called function that numba must not inline, which saves compile time."""
     CALLED.add(function)
     return function
 
@@ -180,12 +180,12 @@ def times(a, value):
 
 
 def product(columns, a):
-    """Return a matrix, given by its columns, times a vector."""
+    """Return M a for the matrix M with the given columns."""
     return plus(plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2]))
 
 
 def across(columns, a):
-    """Return the transpose of a matrix, given by its columns, times a vector."""
+    """Return M^T a for the matrix M with the given columns."""
     return dot(columns[0], a), dot(columns[1], a), dot(columns[2], a)
 
 
@@ -233,8 +233,8 @@ def cosine_and_sine(x):
     p = -1.38888888888741095749e-03 + z * p
     p = 4.16666666666666019037e-02 + z * p
     cosine = (1.0 - 0.5 * z) + z * z * p
-    # Rotate back by the subtracted multiple of pi/2. The cosine `even` and the sine `odd` of this
-    # multiple are (1, 0), (0, 1), (-1, 0) or (0, -1).
+    # Rotate back by the subtracted multiple of pi/2. `even` is the cosine of the multiple, and
+    # `odd` is the sine. Together they are (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * 0.5)
     odd = turns - half - half
     sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
@@ -288,7 +288,7 @@ def attitude(q, at=0):
 
 
 def axes_of(q):
-    """Return the base's three axes in world coordinates, the columns of its rotation matrix."""
+    """Return the columns of the base's rotation matrix: the base's axes in world coordinates."""
     return columns_of(attitude(q))
 
 

@@ -1,4 +1,4 @@
-"""Check of A and B by ABA derivatives and by finite differences of the nonlinear model."""
+"""Check of linear models by ABA derivatives and by finite differences of the nonlinear model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fflin.robot.robot import Robot
 
 
 class Row(NamedTuple):
-    """One error of a check, with its tolerance."""
+    """One error of a check, and the tolerance of the error."""
 
     test: str
     block: str
@@ -62,20 +62,20 @@ _ROUTE_SAFETY = 10.0
 # fewer than two digits.
 _LOOSEST = 1e-2
 
-# The terms with the base's linear velocity cancel in exact arithmetic. Numerically, they leave
-# rounding errors of about 1e-16 of their magnitude. The errors of A are therefore divided by a
-# scale that includes this fraction of the terms. The fraction times the tolerance 1e-9 is far
-# above 1e-16. A larger fraction would hide other errors.
+# The terms with the base's linear velocity cancel in exact arithmetic. Numerically, rounding errors
+# of about 1e-16 of the terms remain. So the scale by which the errors of A are divided includes
+# _ROUNDING_FRACTION times the terms. _ROUNDING_FRACTION times the tolerance 1e-9 is far above
+# 1e-16. A larger _ROUNDING_FRACTION would hide other errors.
 _ROUNDING_FRACTION = 1e-3
 
 
-# If the base is faster than this speed [m/s], velocities are measured relative to an observer that
-# moves with the constant velocity of the base at the operating point. Without such an observer, the
+# If the base is faster than _FAST [m/s], velocities are measured relative to an observer. The
+# observer moves with the velocity that the base has at the operating point. Without the observer,
 # rounding errors of the base velocity would hide the other velocities.
 _FAST = 100.0
 
-# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
-# h^6 f^(7) / 140.
+# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. The error of the
+# difference is h^6 f^(7) / 140.
 _WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
@@ -272,8 +272,8 @@ def _output_errors(
 ) -> dict[str, float]:
     """Return the errors of y0, C and D.
 
-    y0 is compared with the outputs of the nonlinear model, and C and D are compared with finite
-    differences of these outputs.
+    y0 is compared with the outputs of the nonlinear model. C and D are compared with finite
+    differences of the outputs.
     """
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
@@ -355,9 +355,9 @@ def aba_route(
     state = aba.state
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
-    # Place the base at the world's origin, because Pinocchio differentiates about this origin, and
-    # a distant base would reduce the accuracy. Moving the base is allowed, because no derivative
-    # depends on the position of the base, even in orbit.
+    # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
+    # So place the base at the world's origin. This is allowed, because no derivative depends on the
+    # position of the base, even in orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
@@ -404,11 +404,11 @@ class Scales:
         the steps (nx,) of the differences in `steps`, and the rounding error of the differences,
         divided by the tolerance, in `rounding`.
         """
-        # Divide each row of an acceleration by the mobility of its coordinate, so that a light
+        # Divide the row of each acceleration by the mobility of the coordinate, so that a light
         # joint does not hide the error of a heavy joint. Divide each column of B by the mobility of
-        # its input. After this scaling, divide the errors of a block of A by the largest entry of
-        # the block. If larger terms cancel in the block, divide by the magnitude of these terms
-        # instead, because their rounding errors do not cancel.
+        # the input. Next, divide the errors of each block of A by the largest scaled entry of the
+        # block. Terms that are larger than the entries may cancel in a block, but the rounding
+        # errors of the terms remain. If so, divide by the magnitude of the terms.
         state, lin, nv = self._state, self._lin, self._nv
         terms = self._terms
         if steps is not None:
@@ -431,8 +431,8 @@ class Scales:
 
         In the rows of accelerations, the terms are divided by the mobility of their coordinate.
         """
-        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because the terms with
-        # this velocity contribute only rounding errors to Pinocchio's derivatives.
+        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because terms with the
+        # linear velocity contribute only rounding errors to Pinocchio's derivatives.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -467,8 +467,8 @@ class Scales:
 class Nonlinear:
     """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, computed by ABA.
 
-    If the linear model has a moving reference, x is the error relative to this reference, and f is
-    0 at the operating point.
+    If the linear model has a moving reference, x is the error relative to the reference. In this
+    case, f is 0 at the operating point.
     """
 
     def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
@@ -502,7 +502,7 @@ class Nonlinear:
         state, (chart, _, v, a) = self.state, self.accelerations(point)
         # The error (5.1) relative to a reference with velocities v* and w* has the derivatives
         # de/dt = (e0 (w - w*) + e x (w + w*)) / 2 and dr/dt = R_e v - v* - w* x r. Here (e, e0) is
-        # the error quaternion, and R_e is its rotation matrix.
+        # the error quaternion, and R_e is the rotation matrix of the error.
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)

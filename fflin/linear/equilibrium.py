@@ -19,8 +19,9 @@ from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# Assumed rounding error of forces and of principal moments of inertia, relative to the magnitudes
-# of the terms whose sum they are. Also the largest spring deflection [rad or m] that is not shown.
+# Forces and principal moments of inertia are sums of terms. Their assumed rounding error is this
+# fraction of the magnitude of the terms. The same number is the largest spring deflection
+# [rad or m] that is not shown.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 

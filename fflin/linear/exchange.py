@@ -309,7 +309,7 @@ def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[A
 
 
 def _step(tool: str, dt: float | None) -> float:
-    """Return the time step dt of a tool after checking it, or 0 if dt is None."""
+    """Check the time step dt [s] of a tool, and return dt, or 0 if dt is None."""
     h = 0.0 if dt is None else number("dt", dt)
     if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(

@@ -1,12 +1,12 @@
 """Linear models and trajectories on disk: npz, mat, json and csv.
 
-A model in csv consists of several tables. They are for other programs; fflin does not read them.
-Each matrix has a table with the names of its rows and columns. The states, the inputs and the
-outputs have a table each. The table ``info`` contains all other entries.
+A model in csv consists of several tables, for other programs. fflin does not read the tables. Each
+matrix has a table with the names of the rows and columns. The states, the inputs and the outputs
+have a table each. The table ``info`` contains all other entries.
 
-A trajectory in csv is one table. Every row of its last column repeats the same digest, which is
-computed from the other columns. So the digest needs no extra line, which other programs could not
-read.
+A trajectory in csv is one table. The last column contains the same digest in every row. The digest
+is computed from the other columns. A digest in a separate line would make the table unreadable for
+other programs.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
 
 
 def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
-    """Read the fields of a model and its certificate from a file; see `LinearModel.load`."""
+    """Read the fields and the certificate of a model from a file; see `LinearModel.load`."""
     with reading(path, "linear model"):
         entries, verified = read_record(path)
         fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
@@ -290,8 +290,8 @@ def _entries(columns: Record, robot: Robot) -> Record:
     require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
     entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
     acting = [name for name in inputs if name in columns]
-    # The last row may lack inputs: if inputs are constant between knots, the last interval ends at
-    # the last knot, and no input acts after it.
+    # If inputs are constant between knots, the last row may lack inputs, because no input acts
+    # after the last knot.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
         entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])

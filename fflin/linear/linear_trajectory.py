@@ -87,7 +87,7 @@ class LinearTrajectory(Trajectory):
         return len(self.A)
 
     def __getitem__(self, index: int) -> LinearModel:
-        """Return the linear model at the knot with this index."""
+        """Return the linear model at the knot with the given index."""
         k = range(len(self))[index]
         lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         own = {name: getattr(self, name)[k] for name in "ABCD"}
@@ -247,8 +247,9 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# Relative accuracy of a sample's transition matrix. The integration steps are halved until this
-# accuracy is reached, or until each interval between knots has _MOST_PARTS parts.
+# _ACCURACY is the required relative accuracy of a sample's transition matrix. The integration steps
+# are halved until the matrix is accurate, or until each interval between knots has _MOST_PARTS
+# parts.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
@@ -267,8 +268,8 @@ class Steps(NamedTuple):
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
     """Yield the integration steps and the transition matrix of each sample of dt [s].
 
-    The transition matrix (nx, nx + nu) maps the error and the input at the start of the sample to
-    the error at its end.
+    The transition matrix (nx, nx + nu) maps the error and the input at the start of a sample to the
+    error at the end of the sample.
     """
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
@@ -302,9 +303,9 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
     """Return the steps and the transition matrix of each sample; see `transitions`.
 
-    Each array in `cuts` contains the start of a sample, the knots in it, and its end. Each interval
-    between these times is divided into `parts` parts. Each part has two steps, one for each
-    exponential in (10.3).
+    Each array in `cuts` contains the times of one sample: the start, the knots within the sample,
+    and the end. Each interval between two times is divided into equal parts, whose number is
+    `parts`. Each part has two steps, one for each exponential in (10.3).
     """
     fraction = np.arange(parts) / parts
     start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]

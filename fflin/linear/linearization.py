@@ -25,8 +25,8 @@ from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
-# Largest allowed sum of the squared entries of an array. A model with a larger sum is refused,
-# because the computation of its eigenvalues would overflow.
+# The sum of the squared entries of each array of a model must be below this value. For larger
+# values, the computation of eigenvalues would overflow.
 LARGEST = 1e200
 
 _STANDING: Chart = Standing()
@@ -128,10 +128,10 @@ def own_reference(robot: Robot, lin: LinearModel) -> Array:
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
-    # A coordinate is ignorable if the dynamics do not depend on it. In orbit, the dynamics depend
-    # on the position and the attitude of the base. For other robots, the position is ignorable,
-    # because gravity is zero or uniform. If gravity is zero, the attitude relative to a moving
-    # reference (`lin.moving`) is ignorable too.
+    # The dynamics do not depend on ignorable coordinates. In orbit, the dynamics depend on the
+    # position and the attitude of the base. For other robots, the position is ignorable, because
+    # gravity is zero or uniform. If gravity is zero, the attitude relative to a moving reference
+    # (`lin.moving`) is also ignorable.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
@@ -335,7 +335,7 @@ class Linearizer:
 
 
 def _require_finite(*arrays: Array) -> None:
-    """Raise `InputError` if an array contains NaN, or its squared norm is at least `LARGEST`."""
+    """Raise `InputError` if an array contains NaN or has a squared norm of `LARGEST` or more."""
     for array in arrays:
         if not np.vdot(array, array) < LARGEST:  # true for NaN as well
             raise InputError(

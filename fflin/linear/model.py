@@ -182,17 +182,17 @@ class LinearModel(StateSpace):
     mean_motion: float = 0.0
 
     def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
-        # The generated `__init__` of a frozen dataclass would set three dozen fields one by one.
-        # This would take as long as the dynamics of a small robot. Instead, all fields are set at
-        # once, and `shared` contains the fields that are equal in all models of a robot.
+        # The generated `__init__` of a frozen dataclass would set three dozen fields one by one,
+        # which takes as long as the dynamics of a small robot. So this method sets all fields at
+        # once. `shared` contains the fields that are equal in all models of a robot.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())
         vars(self).update(shared or {}, **fields)
 
     def __getattr__(self, name: str) -> object:
-        # `shared["_computed"]` is {field: function of the model}. Such a field is computed at its
-        # first access, because its computation takes as long as the dynamics.
+        # `shared["_computed"]` is {field: function of the model}. These fields are computed at the
+        # first access, because the computation of each takes as long as the dynamics.
         make = vars(self).get("_computed", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")

@@ -29,8 +29,8 @@ def assemble(
     """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
     On entry, the upper half of A must be [0, N], as at rest (2.1). The lower halves of A and B are
-    the arrays `rates.slopes` and `rates.by_u`, which contain derivatives in base axes. The function
-    converts these derivatives in place to the chart and the frame.
+    the arrays `rates.slopes` and `rates.by_u`. On entry, both arrays contain derivatives in base
+    axes. The function converts both arrays in place to the chart and the frame.
     """
     state = actuation.state
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
@@ -43,8 +43,8 @@ def assemble(
     theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
 
-    # Write the rows of attitude and position. If the base is at the reference, the blocks of these
-    # rows for the velocities are the same as at rest (2.1), and need not be written.
+    # Write the rows of attitude and position. If the base is at the reference, do not write the
+    # columns of the velocities in these rows: they are the same as at rest (2.1).
     if moving:
         A[..., g.q_b, g.q_b] = A[..., g.r_b, g.r_b] = -W  # (5.2), (5.3)
     else:
@@ -62,7 +62,8 @@ def assemble(
     # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.standing:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # Do not rotate the columns of the base's linear velocity: they are zero until (4.5) below.
+        # The columns of the base's linear velocity need no rotation: before (4.5) below, these
+        # columns are zero.
         chart.turn_rows((ANGULAR,) if omega_in_reference else (), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)
@@ -91,8 +92,8 @@ def _over_rotations(
 ) -> Array:
     """Return the derivative of the accelerations with respect to base rotations (4.4).
 
-    The shape of the derivative is (.., 6 + n, 3). The function may change `rates.by_turn`, because
-    it adds terms in place.
+    The shape of the derivative is (.., 6 + n, 3). The function may add terms to `rates.by_turn` in
+    place.
     """
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
@@ -120,8 +121,8 @@ def _over_rotations(
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     """Return the state derivative (.., nx) of a moving reference (section 5).
 
-    f0 is the state derivative of the robot. Under gravity, the result excludes the rotation about
-    the vertical, because this rotation does not affect the dynamics.
+    f0 is the state derivative of the robot. Under gravity, the result is f0 without the rotation
+    about the vertical, because a rotation about the vertical does not affect the dynamics.
     """
     weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
     if not np.count_nonzero(weight):
