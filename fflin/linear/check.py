@@ -51,7 +51,7 @@ _STEP_ULPS = 64.0
 # The relative tolerance for the comparison with ABA derivatives is the larger of two values:
 # _ROUTE_TOLERANCE, and _ROUTE_ROUNDING times the condition number of M.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# The same for the comparison with finite differences. These two numbers are larger, because the
+# The same two numbers for the comparison with finite differences. Both are larger, because the
 # division by a small step amplifies rounding errors.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
@@ -218,22 +218,22 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
     # If links are far apart, ABA is less accurate than the composite-rigid-body algorithm. So the
-    # error of ABA's derivatives is estimated from the residual M M^-1 - I, in which the
-    # composite-rigid-body algorithm computes M, and ABA computes M^-1.
+    # error of ABA's derivatives is estimated from the residual M M^-1 - I. M is from the
+    # composite-rigid-body algorithm, and M^-1 is from ABA.
     own_error = inertia_residual(M, _in_frame(state, q, aba_inverse))
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     yield "ABA derivatives", scales.errors(A, B), by_aba
 
     model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
-    # If light links are aligned, even a small rotation of a joint changes the accelerations
-    # strongly. So the steps of the finite differences must be small.
+    # The steps of the finite differences must be small. If light links are aligned, even a small
+    # rotation of a joint strongly changes the accelerations.
     steps = np.full(nx + len(lin.u0), 2e-4)
     # Keep the points of the differences well inside the chart, because f is steep near the limit
     # |q_b| = 1 of the chart.
     steps[g.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
-    # f is quadratic in the velocities and linear in the inputs. So central differences have no
-    # truncation error, even with large steps.
+    # f is quadratic in the velocities and linear in the inputs. So central differences with respect
+    # to velocities and inputs have no truncation error, even with large steps.
     speed = np.abs(lin.x0[-nv:])
     steps[nv:nx] = 0.1 * max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:]))
     steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
@@ -287,9 +287,9 @@ def _output_errors(
 
     here, slopes = y(point[None])[0], jacobian(y, point, steps, np.ones(len(point), dtype=bool))
     errors = {"y0": _largest(lin.y0 - here) / max(1.0, float(np.abs(here).max()))}
-    # Divide the errors of a row by the largest derivative of the row, or by `noise` if `noise` is
-    # larger. `noise` is the rounding error of y / step, divided by the tolerance. So a rounding
-    # error alone does not exceed the tolerance.
+    # Divide the errors of a row by the largest derivative in the row, or by `noise` if `noise` is
+    # larger. `noise` is the rounding error of y / step, divided by the tolerance. So rounding
+    # errors alone do not exceed the tolerance.
     noise = _ULPS * _EPS / tolerance * np.maximum(1.0, np.abs(here))[:, None] / steps
     for name, given, part in (("C", lin.C, slice(nx)), ("D", lin.D, slice(nx, None))):
         largest = np.abs(slopes[:, part]).max(axis=1, initial=0.0, keepdims=True)
@@ -400,9 +400,9 @@ class Scales:
     ) -> dict[str, float]:
         """Compare the model with other A and B; return {block: error}.
 
-        A block is, for example, "A[q_b, q_m]". If A and B were computed by finite differences, give
-        the steps (nx,) of the differences in `steps`, and the rounding error of the differences,
-        divided by the tolerance, in `rounding`.
+        A block is, for example, "A[q_b, q_m]". Give `steps` and `rounding` if A and B were computed
+        by finite differences. `steps` (nx,) are the steps of the differences. `rounding` is the
+        rounding error of the differences, divided by the tolerance.
         """
         # Divide the row of each acceleration by the mobility of the coordinate, so that a light
         # joint does not hide the error of a heavy joint. Divide each column of B by the mobility of
@@ -429,7 +429,7 @@ class Scales:
     def _sizes(self, v: Array) -> tuple[Array, float]:
         """Return magnitudes of terms that cancel: (6, 6) for the blocks of A, and one for f0.
 
-        In the rows of accelerations, the terms are divided by the mobility of their coordinate.
+        In the row of each acceleration, the terms are divided by the mobility of the coordinate.
         """
         # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because terms with the
         # linear velocity contribute only rounding errors to Pinocchio's derivatives.
@@ -442,9 +442,9 @@ class Scales:
         for _, stored in robot.stored_momentum:
             momentum += float(np.linalg.norm(stored))
         rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
-        # Gyroscopic torque of the wheels per unit angular velocity of their link, multiplied by the
-        # largest mobility. A torque times the mobility is the scaled acceleration, because the
-        # acceleration is the torque times the squared mobility.
+        # Gyroscopic torque of the wheels per unit angular velocity of the links, multiplied by the
+        # largest mobility. The acceleration is the torque times the squared mobility. So the scaled
+        # acceleration is the torque times the mobility.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
         slowed = speed.copy()
         slowed[LINEAR] *= _ROUNDING_FRACTION

@@ -159,7 +159,7 @@ def equilibrium(
     """
     state = StateMap(robot, frame=frame, reference=reference)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
-    if robot.orbit:  # reference at the base, so that forces and inputs are in base axes
+    if robot.orbit:  # put the reference at the base, so that forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
         linearizer = Linearizer(robot, frame=frame, reference=own)
     else:
@@ -223,8 +223,8 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        # Compute bounds (6 + n,) of the rounding errors in the forces, in which large terms may
-        # cancel.
+        # Compute bounds (6 + n,) of the rounding errors in the forces. Large terms may cancel in
+        # the forces.
         state, springs = linearizer.prepared.map, robot.springs
         absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         speed = np.abs(state.velocities(absolute))

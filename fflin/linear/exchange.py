@@ -187,8 +187,8 @@ def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     model, whole = lin.to(tool), lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
-    # The input axes of the tool may rotate relative to the input axes of the model. If so, the
-    # components of a constant input of the model in the axes of the tool vary with the attitude
+    # The input axes of the tool may rotate relative to the input axes of the model. In this case,
+    # an input that is constant in the model's axes varies with the attitude in the tool's axes
     # (15.4).
     turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)

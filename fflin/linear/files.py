@@ -156,10 +156,10 @@ def given(value: T, _: object) -> T:
 
 
 def foreign_table(path: Path) -> Path | None:
-    """Return a file that does not belong to a model, but would be overwritten by saving a model.
+    """Return a file that saving a model would overwrite, although the file contains no model.
 
-    `path` is the path NAME.csv to which the model would be saved. Return None if there is no such
-    file.
+    `path` is the path NAME.csv to which the model is to be saved. Return None if no such file
+    exists.
     """
     info = _csv_path(path, "info")
     own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()

@@ -40,8 +40,8 @@ def require_fit(
 ) -> None:
     """Raise `InputError` if a model does not have the states and inputs of the robot.
 
-    If `sensed` is True, the outputs must be the same too. A reduced model, which lacks some states
-    of the robot, is accepted unless `whole` is True.
+    If `sensed` is True, the model must also have the outputs of the robot. If `whole` is False, a
+    reduced model, which lacks some states of the robot, is accepted.
     """
     made = f"the model was made for '{lin.robot}'"
     require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)

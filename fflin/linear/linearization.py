@@ -48,12 +48,12 @@ class Prepared:
     own_reference : bool
         Whether the reference is the base placement at each point.
     free : bool
-        Whether `common` and `rest` contain all matrices, except B, of a model at rest at its
-        reference.
+        Whether `common` and `rest` contain all matrices except B, if the robot is at rest and the
+        base is at the reference.
     common : dict
         Fields of a model that are the same at all points.
     rest : dict
-        A, f0, u0 and v of a model at rest at its reference, without any forces.
+        A, f0, u0 and v of a model at rest without forces, with the base at the reference.
     """
 
     def __init__(
@@ -229,17 +229,17 @@ class Linearizer:
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         self._rate = "drift" if ready.moving else "f0"
-        # Fields of a model at rest, except B and q. Expensive fields are computed at their first
-        # use.
+        # Fields of a model at rest, except B and q. The fields in `slow` are computed at the first
+        # use, because they are expensive.
         slow = {"x0": ready.state_at, "y0": ready.state_at}
         self._fields = {**ready.common, **ready.rest, "_computed": slow}
         if ready.own_reference:
             slow["placement"] = partial(own_reference, robot)
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether B is the only matrix to be computed for a model at rest. This requires the default
-        # inputs, outputs and reference, and a robot without springs, gravity, orbit or stored
-        # momentum.
+        # Whether B is the only matrix to be computed for a model at rest. This is the case for
+        # default inputs, outputs and reference, if the robot has no springs, gravity, orbit or
+        # stored momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -270,7 +270,7 @@ class Linearizer:
             inverse = out if actuation.default else np.empty((nv, nv))
             inertia.invert(q, inverse)
             if not actuation.default:
-                # Move the base to the origin, which avoids rounding errors. This is allowed,
+                # Move the base to the origin to avoid rounding errors. The result is the same,
                 # because the input matrix B_u does not depend on the base position.
                 np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 

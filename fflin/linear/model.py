@@ -170,10 +170,10 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     drift: Array | None = None
-    # Only for a discretised model or a model from a file: the fingerprint of this model, and the
-    # source, which has the certificate. The source of a discretised model is the continuous-time
-    # model, whose exact zeros are lost in the matrix exponential. The source of a model from a file
-    # is the same model as read from the file.
+    # Only for a discretised model or a model from a file: the fingerprint of the model, and the
+    # source model, which has the certificate. The source of a discretised model is the
+    # continuous-time model, because the matrix exponential loses exact zeros. The source of a model
+    # from a file is the model as read from the file.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None

@@ -97,15 +97,15 @@ def _over_rotations(
     """
     state = actuation.state
     omega_in_reference, v_in_reference = state.axes
-    # `by_turn` is nonzero only in orbit, and in orbit, omega is in base axes. So if omega is in
-    # reference axes, the assignment below replaces only zeros.
+    # `rates.by_turn` is nonzero only in orbit. In orbit, omega is in base axes. So if omega is in
+    # reference axes, `rates.by_turn` is zero, and the product below can replace it.
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)
     for columns in actuation.held if np.count_nonzero(u) else ():
         theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # Change the angular and the linear rows through views with names: `theta[rows] -= y` would also
-    # copy the result back into theta, which takes time.
+    # `turning` and `shifting` are views of the angular and the linear rows of theta. Subtracting
+    # from a view is faster than `theta[rows] -= y`, which also copies the result back into theta.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
     if omega_in_reference:
         turning -= skew(c[..., ANGULAR])
