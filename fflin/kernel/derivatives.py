@@ -2,8 +2,8 @@ r"""M^-1, accelerations and their derivatives at many points, eight points at a 
 
 RNEA is differentiated in closed form. Let S be the spatial axis of a joint, and let v and a be the
 spatial velocity and acceleration of the joint's parent. Define Psi' = v x S and
-Psi'' = a x S + v x Psi'. The derivatives of the joint forces tau with respect to the joint
-positions q and velocities q' are as follows, if joint j is on the path from the base to joint i:
+Psi'' = a x S + v x Psi'. Let joint j be on the path from the base to joint i. The joint forces tau
+then have the following derivatives with respect to joint positions q and velocities q':
 
 .. math::
     \partial\tau_j/\partial q_i &= S_j^T (2 B_i \Psi'_i + I_i \Psi''_i + S_i \times^* f_i) \\

@@ -74,7 +74,7 @@ def clipped(value, low, high):
 
 
 def limit(channel, u):
-    """Saturate inputs at their limits."""
+    """Saturate the commands u at the limits of the channel."""
     for index in range(len(channel.low)):
         value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
         store(u, index, value)
@@ -133,7 +133,7 @@ def transmit(channel, step, nu, u):
 
 
 def _begin_pulses(channel, step, u):
-    """Fire the pulses of a new sample for the commands u; store the impulses that are not fired.
+    """Start the pulses of a new sample for the commands u, and store the impulse that remains.
 
     Lanes in which `fresh` is 0 do not change.
     """
@@ -238,8 +238,7 @@ def _combine(shares, row, rates, out):
 def goes_on(stop, origin, q, rates):
     """Return True if all velocities are below their limits and the base is within the chart.
 
-    `rates` are the velocities. Compiled code returns True only if both conditions are met in all
-    lanes.
+    `rates` are the velocities. In compiled code, both conditions must be met in all lanes.
     """
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))

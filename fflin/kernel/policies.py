@@ -22,7 +22,7 @@ class Path(
         "Path", "t q u shift speed hold ahead ends held over last starts K order along e point"
     )
 ):
-    """A trajectory and the gains of its feedback as piecewise polynomials.
+    """A trajectory and its feedback gains, both as piecewise polynomials.
 
     - `t` (N,) [s]: the times of the knots. `q`, `u`: one row per knot.
     - `shift`, `speed`: coefficients (4, 6 + n) of cubic polynomials for each interval between two
@@ -99,9 +99,10 @@ def error(robot, path, point):
 
 
 def track(robot, path, point, u, t):
-    """Write the command u* - K e at the time t of the run; u* are the trajectory's inputs.
+    """Write the command u* - K e at the time t of the run, where u* are the trajectory's inputs.
 
-    Wrenches of the trajectory in world axes are rotated to the axes of the trajectory's base.
+    Torques and forces of the trajectory in world axes are rotated to the axes of the base at the
+    followed point.
     """
     # Evaluate the trajectory at the time t.
     there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)

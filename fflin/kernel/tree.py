@@ -86,7 +86,7 @@ class Struct(Generic[T_co]):
         self.name = f"Struct({made.__name__})"
 
     def __call__(self, words: T) -> T:
-        """Return a named tuple unchanged; compiled code replaces this call by `opener`."""
+        """Return a named tuple unchanged. In compiled code, `opener` replaces this method."""
         return words
 
 

@@ -306,7 +306,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     """Return the minimum-norm u that minimises ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # Inputs below the rounding error of the largest input are only noise, so they are set to zero.
+    # Set inputs below the rounding error of the largest input to zero, because they are only noise.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u
 

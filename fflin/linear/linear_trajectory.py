@@ -268,8 +268,8 @@ class Steps(NamedTuple):
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
     """Yield the integration steps and the transition matrix of each sample of dt [s].
 
-    The transition matrix (nx, nx + nu) maps the error and the input at the start of a sample to the
-    error at the end of the sample.
+    The transition matrix (nx, nx + nu) computes the error at the end of a sample from the error and
+    the input at the start.
     """
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
