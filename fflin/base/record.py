@@ -51,7 +51,7 @@ _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
     """Write a record in the format of the path's ending, with a digest if `checksummed`."""
-    writing.check_ending(path, FORMATS)
+    writing.check_ending(path, writing.RECORDS)
     require_finite(record)
     writing.write_atomically({path: CODECS[path.suffix][0](record, checksummed)})
 
@@ -63,7 +63,7 @@ def read_record(path: Path) -> tuple[Record, bool]:
     """
     # The shape of an array may differ from the saved shape, because .mat has no vectors and .json
     # has no empty matrices.
-    writing.check_ending(path, FORMATS)
+    writing.check_ending(path, writing.RECORDS)
     return CODECS[path.suffix][1](writing.read_file(path, path.suffix))
 
 
@@ -231,12 +231,12 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     return record, bool(found)
 
 
+# {ending: (writer, reader)} for each of `writing.RECORDS`
 CODECS = {
     ".npz": (_to_npz, _from_npz),
     ".mat": (_to_mat, _from_mat),
     ".json": (_to_json, _from_json),
 }
-FORMATS = tuple(CODECS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -20,6 +20,9 @@ from pathlib import Path
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
 
+# Endings of saved results. `base.record` reads and writes them.
+RECORDS = (".npz", ".mat", ".json")
+
 # If a file is missing, similar names are suggested only if its folder contains fewer names than
 # this.
 _MANY = 1000

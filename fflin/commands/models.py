@@ -14,7 +14,7 @@ import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
 from fflin.base.names import runs
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals
-from fflin.base.writing import check_ending, write_atomically
+from fflin.base.writing import RECORDS, check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
     SHOWN,
@@ -156,7 +156,7 @@ def linearize(arguments: Namespace) -> Report:
     if tool and not path:
         raise InputError("--for saves the converted model; add -o FILE")
     if path and (tool or arguments.trajectory):
-        check_ending(path, (".npz", ".mat", ".json"))
+        check_ending(path, RECORDS)
     if arguments.trajectory:
         refuse(arguments, ("for",), "this option converts one model, but --trajectory gives many")
         refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")

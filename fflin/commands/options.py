@@ -1,5 +1,9 @@
 """Options of each command: their groups and their help texts."""
 
+from fflin.base.writing import RECORDS
+
+_SAVED = ", ".join(RECORDS)
+
 # Titles of the groups of options in the help.
 POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
@@ -184,7 +188,7 @@ ABOUT: dict[str, str] = {
     "(a joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
     "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative to "
     "frame TO)",
-    "trajectory": "use the trajectory in FILE: .npz, .mat, .json or .csv; see "
+    "trajectory": f"use the trajectory in FILE: {_SAVED} or .csv; see "
     "fflin.Trajectory.load. --frame states the axes in which FILE gives base velocities and "
     "wrenches. The default of --frame is the frame named in FILE or, if there is none, local",
     "hold": "inputs between the knots of FILE: linearly interpolated (linear), or constant from "
@@ -222,7 +226,7 @@ ABOUT: dict[str, str] = {
     "gain": "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point "
     "for which the gain was designed",
     "controller": "use a linear controller K with positive feedback, u - u0 = K (y - y0), about "
-    "the target. FILE (.mat, .npz or .json) contains the matrices A, B, C and D of the controller "
+    f"the target. FILE ({_SAVED}) contains the matrices A, B, C and D of the controller "
     "and, if the controller is sampled, its sample time dt or Ts. --output defines y",
     "negative-feedback": "apply the controller of --controller with negative feedback, u - u0 = -K "
     "(y - y0)",
@@ -278,7 +282,7 @@ ABOUT: dict[str, str] = {
     "runs",
     "show": "show only these curves in --plot. NAME is a state, input, group or pattern, such as "
     "q_m or '*.hinge_*'",
-    "FILE": "gain, compensator or gain schedule saved by fflin: .npz, .mat or .json",
+    "FILE": f"gain, compensator or gain schedule saved by fflin: {_SAVED}",
     "output-folder": "folder for the code; a missing folder is created",
     "robot": "robot for which FILE was designed: a name listed by `fflin robots`, or the path of a "
     "URDF or robot.toml. The default is the robot that FILE names",

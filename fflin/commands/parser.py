@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from fflin.base.errors import FflinWarning, one_line
+from fflin.base.writing import RECORDS
 from fflin.commands import BAD_INPUT
 from fflin.commands.options import ABOUT, COMMON, DESCRIPTIONS, OPTIONS, OUTPUT
 
@@ -154,7 +155,7 @@ def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
     return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
 
 
-def _saved(*kinds: str, endings: tuple[str, ...] = (".npz", ".mat", ".json")) -> Form:
+def _saved(*kinds: str, endings: tuple[str, ...] = RECORDS) -> Form:
     """Return the `Form` of the option -o; `kinds` are the class names of the command's results."""
     return one(OutputFile(endings, kinds), "FILE")
 
@@ -168,7 +169,7 @@ _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, 
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
 _FORMER: Form = {**_TIME, "dest": "former_dt"}
 _UNSATURATED: Form = {"choices": ("urdf", "none"), "default": "none"}
-_TABLE = (".npz", ".mat", ".json", ".csv")
+_TABLE = (*RECORDS, ".csv")
 
 # {option or ARGUMENT: its `Form`}. A key "COMMAND OPTION" applies to this command only.
 # Options without an entry are switches.

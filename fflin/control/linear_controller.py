@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fflin.base.errors import FileError, InputError, listed, located, unknown
-from fflin.base.record import FORMATS, read_record, reading, texts
+from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
-from fflin.base.writing import as_path, check_ending, reason
+from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
 from fflin.dynamics.integrators import held_exponential
@@ -335,7 +335,7 @@ def _checked(*given: Any) -> System:
 
 
 def _read(path: Path) -> System:
-    check_ending(path, FORMATS)
+    check_ending(path, RECORDS)
     with reading(path, "controller"):
         found, _ = read_record(path)
         if len(found) == 1 and isinstance(struct := next(iter(found.values())), dict):

@@ -27,7 +27,7 @@ from fflin.base import record
 from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, vector
-from fflin.base.writing import check_ending, csv_table, read_file, write_atomically
+from fflin.base.writing import RECORDS, check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.state import Actuation, StateMap
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
-FORMATS = (*record.FORMATS, ".csv")
+FORMATS = (*RECORDS, ".csv")
 
 _SIGNALS = ("state", "input", "output")
 # Arrays of a model in a file: {field: which names label each dimension}.
@@ -278,7 +278,7 @@ def _entries(columns: Record, robot: Robot) -> Record:
     if "t [s]" in columns:
         raise FileError(
             "this table contains a motion, expected a trajectory; save motion.trajectory() in "
-            "its place, or save the motion as .npz, .mat or .json"
+            f"its place, or save the motion as {', '.join(RECORDS[:-1])} or {RECORDS[-1]}"
         )
     state = StateMap(robot)
     inputs = Actuation(state).names

@@ -15,7 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.figures import Figure
 from fflin.base.record import Design
 from fflin.base.validation import Array, Open, Vector, instance
-from fflin.base.writing import as_path, check_ending
+from fflin.base.writing import RECORDS, as_path, check_ending
 from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
@@ -26,7 +26,7 @@ from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
 from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
 
-FORMATS = (*record.FORMATS, ".csv")
+FORMATS = (*RECORDS, ".csv")
 
 # Tolerance [SI units] of positions and rates when phases are joined: a phase must start where the
 # phase before it ended. If the largest rate at this time exceeds 1, the tolerance is multiplied by

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.record import content_digest, read_record
+from fflin.base.record import CODECS, content_digest, read_record
 from fflin.base.validation import NOT_VERIFIED
+from fflin.base.writing import RECORDS
 from tests.support.messages import any_wording
 
 FLIPS = 150
@@ -182,6 +183,10 @@ def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
     path.write_text(path.read_text().replace('"dt": 0.0', '"dt": 0.1'))
     with pytest.raises(fflin.FileError, match="sha256"):
         fflin.LinearModel.load(path)
+
+
+def test_each_ending_has_a_codec():
+    assert tuple(CODECS) == RECORDS
 
 
 def test_the_digest_is_what_the_documents_say(tmp_path):
