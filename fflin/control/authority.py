@@ -15,10 +15,15 @@ from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
 
-_FACETS = 20_000  # normals computed together
-_MANY = 36  # thrusters; their zonotope has 400 000 facets
+# Number of facet normals that `least_reach` computes in one batch.
+_FACETS = 20_000
 
-# A value below this, relative to the largest value, counts as rounding error.
+# Largest number of thrusters for which the authority is computed. The wrenches of 36 thrusters
+# already form a zonotope with 750 000 facets.
+_MANY = 36
+
+# A magnitude below this counts as rounding error. It is relative to the largest moment of inertia,
+# or to the length of a unit vector.
 _ROUNDING = 1e-9
 
 _AXES = "xyz"
@@ -30,7 +35,9 @@ class WheelMomentum(NamedTuple):
     wheels: int
     total: Array  # (3,) [N m s]
     axes: int  # number of axes that the wheels span
-    least: float | None  # largest momentum that can be stored in every direction, if bounded
+    # Largest momentum [N m s] that the wheels can store in every direction. It is None if the
+    # wheels span fewer than three axes, or if the momentum of a wheel has no limit.
+    least: float | None
 
     def __str__(self) -> str:
         if not self.wheels:
@@ -185,19 +192,20 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     The directions are the vectors ``kept d`` with unit vectors d. For each of them, some inputs u
     within their limits satisfy ``W u = r kept d``, and r is the largest number with this property.
 
-    The wrenches ``W u`` of inputs between `low` and `high` form a zonotope
-    :math:`\{w : n^T w \le h(n)\}` with :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)`,
-    where :math:`W_i` is column i of W. The normal n of each facet is orthogonal to m - 1
-    independent columns of W. In the subspace spanned by the columns of `kept`, the distance of the
-    facet from the origin is :math:`h(n) / |kept^T n|`. The smallest of these distances is r.
+    The wrenches ``W u`` of inputs between `low` and `high` form a zonotope. It contains each w with
+    :math:`n^T w \le h(n)` for all vectors n, where
+    :math:`h(n) = \sum_i \max(low_i n^T W_i, high_i n^T W_i)` and :math:`W_i` is column i of W. The
+    normal n of each facet is orthogonal to m - 1 independent columns of W. In the subspace spanned
+    by the columns of `kept`, the distance of the facet from the origin is
+    :math:`h(n) / |kept^T n|`. The smallest of these distances is r.
 
     Parameters
     ----------
     W : ndarray (m, k)
-        Wrench (or momentum) of each unit input; the rank of W is m.
+        Column i is the wrench (or momentum) of a unit value of input i. The rank of W must be m.
     low, high : ndarray (k,)
-        Limits of the inputs, with ``low <= 0 <= high``.
-    kept : ndarray (m, d)
+        Limits of the inputs. They must satisfy ``low <= 0 <= high``.
+    kept : ndarray (m, p)
         Orthonormal columns, which span the subspace of the directions.
     """
     scale = np.linalg.norm(W, axis=1)
@@ -205,7 +213,7 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     columns /= np.linalg.norm(columns, axis=0)
     subsets, least = combinations(range(W.shape[1]), len(W) - 1), math.inf
     while chunk := list(islice(subsets, _FACETS)):
-        chosen = columns[:, np.array(chunk)].transpose(1, 0, 2)  # (facets, m, m - 1)
+        chosen = columns[:, np.array(chunk)].transpose(1, 0, 2)  # (normals, m, m - 1)
         minors = [np.linalg.det(np.delete(chosen, row, axis=1)) for row in range(len(W))]
         normals = np.stack(minors, axis=1) * (-1.0) ** np.arange(len(W))
         normals = normals[np.linalg.norm(normals, axis=1) > _ROUNDING]

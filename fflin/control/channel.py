@@ -167,7 +167,7 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 def channelled(
     law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
 ) -> Inputs:
-    """Return a function f(step, *point) that computes the inputs (nu,) of a step with a channel.
+    """Return f(step, *point), which sends a command through a channel and returns inputs (nu,).
 
     f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds (k,) of the
     wheels whose speed is limited.

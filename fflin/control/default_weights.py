@@ -24,14 +24,15 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # joint displacement is at most TRAVEL times the joint's position limit.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# If a mode is unstable, the bandwidth is at least _OF_GROWTH times the growth rate of the mode.
-# Effort limits may reduce the bandwidth to _LEAST_OF_GROWTH times this rate. With a lower
-# bandwidth, joints with a small inertia would swing by several radians.
+# If a mode is unstable, the initial bandwidth is at least _OF_GROWTH times the growth rate of the
+# mode. Effort limits may then reduce the bandwidth, but only to _LEAST_OF_GROWTH times this rate.
+# With a lower bandwidth, joints with a small inertia would swing by several radians. A sampling
+# time that is too long for these bandwidths takes precedence.
 _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 
-# In the weight on velocities (10.8), the effect S R^-1 S' of the inputs is replaced by this
-# fraction of D (10.7) in every direction in which it is smaller. A mode on which the inputs have a
-# smaller effect keeps its open-loop decay.
+# In the weight on velocities (10.8), the effect S R^-1 S' of the inputs is raised to this fraction
+# of D (10.7) in every direction in which the effect is smaller than this. A mode on which the
+# inputs have a smaller effect keeps its open-loop decay.
 _LEAST_REACH = 1e-3
 
 # The inputs count as having no effect on coordinate i if the diagonal entry i of S R^-1 S' is at
@@ -68,7 +69,7 @@ class Pace(NamedTuple):
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0  # factor on the design displacements
     hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
-    held: float = _HELD  # [rad], largest frequency of a mode times the hold time
+    held: float = _HELD  # [rad], largest permitted product of mode frequency and hold time
 
 
 class Limit(NamedTuple):
@@ -79,7 +80,7 @@ class Limit(NamedTuple):
 
 
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
-    """Return the weights (10.7), with which a displaced robot moves back within its limits.
+    """Return the weights (10.7), with which a displaced robot returns without exceeding its limits.
 
     `momenta` maps the name of each wheel speed to the largest momentum [N m s] that the inputs may
     add to the wheel.
@@ -103,7 +104,8 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
 def _damping(lin: LinearModel) -> Array:
     """Return the viscous damping matrix B (m, m), which is zero for a sampled model."""
     m = len(lin.M)
-    if lin.dt or not lin.A[m:, m:].any():  # in a sampled model, springs look like damping
+    # In the matrix A of a sampled model, springs look like damping. B is therefore set to zero.
+    if lin.dt or not lin.A[m:, m:].any():
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
@@ -219,7 +221,8 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     names, units = lin.state_names[:m], lin.state_units[:m]
     M, radius, size = lin.M, 1.0, np.empty(m)
     if names[:6] == state_keys(())[:6]:
-        # Radius of a spherical shell that has the mass of the robot and the trace of its inertia.
+        # The radius of gyration is the radius of a thin spherical shell that has the mass of the
+        # robot and the trace of its inertia.
         mass = M[3, 3]
         center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
         moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
@@ -238,10 +241,10 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest speeds (k,) during the return from displacements `size` (m,).
+    """Return the largest speeds and wheel momenta (k,) during the return from displacements.
 
-    The speeds are computed for a bandwidth of 1 rad/s. T (k, m) maps the rates of the modes to the
-    speeds.
+    The displacements have the magnitudes `size` (m,), and the bandwidth is 1 rad/s. T (k, m) maps
+    the rates of the modes to the speeds and the wheel momenta.
     """
     # Each mode x obeys ``mass x'' + most x' + rates^2 x = 0``. The modes are normalised with
     # M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
@@ -280,7 +283,8 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     """Return the largest magnitude of each entry of ``K d``, over all displacements d.
 
     The displacements d have the magnitudes `size` (m,). The rotation and the offset of the base may
-    have any direction, and the displacement of each joint may have either sign.
+    have any direction, and the displacement of each joint may have either sign. Only the first m
+    columns of K are used.
     """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
@@ -291,10 +295,10 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
 
 
 def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
-    """Return, for each limited signal, the bandwidth factor at which the signal reaches its limit.
+    """Return, for each limited signal, the factor on the bandwidth at which it reaches its limit.
 
-    With a factor of 1, the signals have the values `used`. They are proportional to the factor
-    raised to the power `power`.
+    `room` maps the name of each signal to its limit. With a factor of 1, the largest values of the
+    signals are `used`. The values are proportional to the factor raised to the power `power`.
     """
     return [
         Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
@@ -372,20 +376,25 @@ def _slowed(
         # only an estimate. The bandwidth is therefore reduced in steps.
         limit = max(Limit(min(max(left, 0.3), 0.8) * w, effort), least)
     if not trials:
-        return limit, ""  # the design of the regulator fails and reports the reason
+        return limit, ""  # the later design of the regulator also fails, and reports the reason
     enough = _IN_VAIN * max(left for left, *_ in trials)
     _, effort, (w, reason), said, required = next(x for x in trials if x[0] >= enough)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
-    held = reason == least.what  # a slower loop cannot control the unstable mode
+    # True if an unstable mode or the sampling time determines the bandwidth, and not an effort.
+    held = reason == least.what
     what = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
     return Limit(w, what), said
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
-    """Return the names of the coordinates that move most in one of `modes`, weighted by inertia."""
+    """Return the names of the coordinates that move most in at least one column of `modes`.
+
+    A coordinate is included if its motion, times the square root of its inertia, exceeds half of
+    the largest such product in the same mode.
+    """
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)

@@ -311,9 +311,10 @@ class Margins(NamedTuple):
     disk : float
         Symmetric disk margin, at most 2; 0 at the stability boundary.
     gain : tuple of float
-        Least and largest factor on the gain of each input.
+        Least and largest gain factor. The loop is stable if the factors at all inputs are between
+        them.
     phase : float
-        Phase lag or lead of each input [deg].
+        Phase margin [deg]. The loop is stable if the phase lag or lead at each input is smaller.
     """
 
     disk: float

@@ -395,7 +395,7 @@ def tvkalman(
         P = weight("P0", P0, traj.state_names)
     held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
     maps = np.array([whole for _, whole in held])
-    disturbed = np.zeros((len(held), nx, nx))  # covariance that is added during each sample
+    disturbed = np.zeros((len(held), nx, nx))  # covariance that the disturbance adds per sample
     with riccati.bounded_by("a smaller W or a larger V"):
         for covariance, (steps, _) in zip(disturbed, held, strict=True):
             early, late = (np.array([intensity(t) for t in of]) for of in steps.nodes.T.tolist())

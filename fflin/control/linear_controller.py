@@ -25,7 +25,7 @@ from fflin.linear.fit import about_point, require_fit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default names of signals
+_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default signal names such as u[0], or no name
 
 # A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds
 # _ROUNDING * (1 + largest pole magnitude).
@@ -146,7 +146,8 @@ class LinearController(Feedback):
                 "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
         dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not nz) else by.dt
-        dt = lin.dt or dt if dt < 0.0 else dt  # a sampled system with unknown sample time
+        # A negative dt stands for an unknown sample time. The dt of a sampled model replaces it.
+        dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
             raise InputError(
                 f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
@@ -310,7 +311,10 @@ def _system_of(given: Any) -> System:
 
 
 def _checked(*given: Any) -> System:
-    """Return the system with arrays of consistent sizes; an empty A means a static gain D."""
+    """Return the system, or raise `InputError` if the sizes of its matrices are inconsistent.
+
+    If A is empty, the system is the static gain D.
+    """
     *matrices, dt, inputs, outputs = System(*given)
     defaults = (), (), (), 0.0
     A, B, C, D = (
@@ -370,7 +374,8 @@ def _indices(
     if not named:
         return list(range(size))
     own, there = list(names), list(known)
-    if not {*own} <= {*there}:  # python-control has no dots in names
+    if not {*own} <= {*there}:
+        # Names in python-control cannot contain dots, so underscores may replace the dots.
         own, there = ([name.replace(".", "_") for name in each] for each in (own, there))
     for name, key in zip(names, own, strict=True):
         if key not in there:

@@ -262,7 +262,10 @@ def _diagonal(
 
 
 def require_fixed_point(lin: LinearModel) -> None:
-    """Raise `EquilibriumError` if f0 is not zero, or `ModelError` if the robot has changed."""
+    """Raise `EquilibriumError` if the operating point of a model is not a fixed point.
+
+    Raise `ModelError` if the robot's Pinocchio model was modified after the robot was created.
+    """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     if lin.is_equilibrium():
         return
@@ -285,7 +288,7 @@ def require_fixed_point(lin: LinearModel) -> None:
 
 
 def _difference(a: Array, b: Array, c: Array) -> Array:
-    """Return a - b c, and set entries to zero that are only rounding errors."""
+    """Return a - b c, with zeros in place of entries that are only rounding errors."""
     rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     difference = a - b @ c
     return np.where(np.abs(difference) > rounding, difference, 0.0)

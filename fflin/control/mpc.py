@@ -30,19 +30,20 @@ from fflin.robot.robot import Robot
 # Weights Q, R and Qf, and the rule that gives Q and R if they are None.
 Cost: TypeAlias = "tuple[Weight | None, Weight | None, Weight | str, Rule | None]"
 
-# Largest number of entries of the matrices that map inputs to states and limits. Matrices with this
-# number of entries fill 160 MB.
+# Largest number of entries of the matrices that map the inputs to the predicted states and limited
+# signals. Matrices with this number of entries fill 160 MB.
 _MOST_ENTRIES = 20_000_000
 
 # Settings of the solver DAQP. The rows of the constraints are scaled to length 1. The width of a
-# limit is its upper bound minus its lower bound. _EXACT is the tolerance of the constraints, and
-# _PRICE is the weight of soft-limit violations, both relative to the median width. _YIELDS is the
-# regularisation of soft limits. If a plan exceeds a soft limit by less than _VIOLATED times the
-# median width, the violation is not reported.
+# limit is the upper bound minus the lower bound of its scaled row. _EXACT is the tolerance of the
+# constraints, and _PRICE is the weight of soft-limit violations, both relative to the median width.
+# _YIELDS is the regularisation of soft limits. If a plan exceeds a soft limit by less than
+# _VIOLATED times the median width, the violation is not reported.
 _EXACT, _PRICE, _YIELDS, _VIOLATED = 1e-9, 1e3, 1.0, 1e-6
 
-# If the robot exceeds a limit by less than this fraction of the difference between the upper and
-# the lower limit, the violation is not reported.
+# If the robot exceeds a soft limit by at most this fraction of the difference between the upper and
+# the lower limit, the violation is not reported. For a limit on one side only, this is the smallest
+# reported violation, in the unit of the signal.
 _OVER = 1e-3
 
 # The two kinds of soft-limit violations in the notes of a run.
@@ -300,13 +301,13 @@ class Stage(NamedTuple):
     """One predicted sample: ``e' = A e + B d`` with ``d = u - u*``, and limits on ``E e' + D d``.
 
     e and e' are the errors at the start and at the end of the sample, and u* are the reference
-    inputs. The rows of the input limits come first in E and D.
+    inputs. E and D have a row for each of the m limited signals. The inputs come first.
     """
 
     A: Array  # (nx, nx)
     B: Array  # (nx, nu)
     K: Array  # (nu, nx), gain of the regulator without limits
-    L: Array  # (nu, nu): d = L z - K e costs z'z more than the regulator
+    L: Array  # (nu, nu): d = L z - K e costs z'z more than d = -K e
     E: Array  # (m, nx)
     D: Array  # (m, nu)
     low: Array  # (m,)
@@ -404,7 +405,7 @@ class Horizon:
         return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
-        """Return the lower limits, the upper limits and a mask of the soft limits, each (m,)."""
+        """Return the lower limits, the upper limits and a mask of the soft limits of all stages."""
         soft = np.tile(self.at >= len(self.inputs), len(stages))
         low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
         return low, high, soft
@@ -422,8 +423,9 @@ class Receding:
         # For each kind of soft-limit violation: the number of plans or samples with a violation,
         # and the relative magnitude and the description of the largest violation.
         self._violations = dict.fromkeys((_OF_PLANS, _OF_ROBOT), (0, 0.0, ""))
-        self._due: tuple[Stage, Array] | None = None  # the last sample and its input
-        if horizon.limited:  # now, so that the first sample is not slower
+        self._due: tuple[Stage, Array] | None = None  # stage and d of the last sample
+        if horizon.limited:
+            # Set up the solver now, so that the first sample takes no longer than the others.
             self._change(horizon.window(0.0))
             self._start()
 
@@ -461,14 +463,17 @@ class Receding:
             self._model.update(A=self._rows)
         free = self._free @ e
         self.solves += 1
-        if self._due:  # the robot may exceed soft limits because it differs from the model
+        if self._due:
+            # Check the soft limits at the end of the last sample. The robot may exceed a limit even
+            # if the plan does not, because the robot differs from the model.
             by, last = self._due
             reached, width = by.E @ e + by.D @ last, by.high - by.low
             excess = np.maximum(by.low - reached, reached - by.high)
             width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
             self._record(_OF_ROBOT, t - self.of.dt, excess, 1.0 / width, _OVER)
         z, flag = self._solved(free)
-        if flag <= 0:  # solve again without a warm start
+        if flag <= 0:
+            # The solver found no solution. Solve again without a warm start.
             self._start()
             z, flag = self._solved(free)
         if flag == _SOFTENED:
@@ -487,7 +492,7 @@ class Receding:
                     FflinWarning,
                     2,
                 )
-        hard = self.of.at[self.of.at < len(d)]  # the inputs with limits; their rows come first
+        hard = self.of.at[self.of.at < len(d)]  # indices of limited inputs, whose limits come first
         d[hard] = np.clip(d[hard], now.low[: len(hard)], now.high[: len(hard)])
         self._due = now, d
         return d
@@ -512,7 +517,7 @@ class Receding:
         low, high, self._soft = self.of.bounds(stages)
         self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)
-        moved = length > 1e-12 * length.max()  # drops limits that no input affects
+        moved = length > 1e-12 * length.max()  # False for limits that no input affects
         self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit

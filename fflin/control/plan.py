@@ -171,7 +171,7 @@ def plan(
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
-            q[-1], v[-1] = end  # without the rounding errors of the motion
+            q[-1], v[-1] = end  # the integrated motion misses it by at most _REACHED
         note = _note(shooting, made)
         if made.most > _BETWEEN:
             warnings.warn(
@@ -207,9 +207,9 @@ def _least(search: Search) -> _Made:
     """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)
-    cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # the guess costs 1
-    # If the search with limits between the knots fails, it is repeated with limits at the knots
-    # only.
+    cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # cost * u**2 of the guess sums to 1
+    # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
+    # more than the tolerance, a second attempt has limits at the knots only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
         q, v, u, *_ = search._replace(cost=cost, parts=parts).best(*guess)
         if shooting.held:

@@ -144,7 +144,10 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
 
 
 def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> None:
-    """Draw a mode shape: a filled bar for each real part, and an outlined bar for the modulus."""
+    """Draw a mode shape with a filled bar for the real part of each entry.
+
+    For entries out of phase, draw also an outlined bar for the modulus.
+    """
     x, height = np.arange(len(shape)), -0.45  # the axis points down
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)
@@ -304,7 +307,10 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     values = np.array([response(w) for w in grid])
 
     def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the gains of loop i at the frequencies where ``value(gain)`` changes sign."""
+        """Return the gains of loop i at the frequencies where ``value(gain)`` changes sign.
+
+        `among` (k,) is True for the frequencies to search.
+        """
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))

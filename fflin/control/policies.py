@@ -49,7 +49,10 @@ class Feedback:
     lin: LinearModel
 
     def state_map(self, robot: Robot) -> StateMap:
-        """Return the robot's state map in the model's axes; raise `InputError` on a mismatch."""
+        """Return the robot's state map in the model's axes.
+
+        Raise `InputError` if the model does not fit the robot.
+        """
         state = StateMap(robot, reference=self.lin.reference, frame=self.lin.frame)
         require_fit(self.lin, robot, state)
         return state
@@ -187,7 +190,10 @@ class AllocatedPolicy:
         return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the inputs (nu,) whose generalised force is nearest to the commanded force."""
+        """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
+
+        All inputs are within their limits.
+        """
         state = self._design.state
         chart = state.chart(q)
         u = self._design.in_base_axes(chart, self._command(t, q, v))
@@ -236,7 +242,8 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
 # Function of the command u that returns the outputs y.
 Measure: TypeAlias = Callable[[Array], Array]
 
-# Function of a controller's state z that returns the command, and the next z or dz/dt.
+# Function of a controller's state z and a `Measure` that returns the command, and the next z or
+# dz/dt.
 Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
 
 # Function of time that returns three values: the step function of a compensator, a function that
@@ -263,7 +270,8 @@ class Sample(NamedTuple):
         """Return the command, and the next z or dz/dt."""
         z = z + self.jump
         u: Array = self.u0 + self.C @ z
-        if self.D.any():  # acts on outputs that do not depend on u
+        if self.D.any():
+            # D acts only on outputs that do not depend on u, so `measure` can use an incomplete u.
             u = u + self.D @ (measure(u) - self.y0)
         return u, self.A @ z + self.B @ (measure(u) - self.y0)
 
@@ -316,7 +324,11 @@ class Loop:
         return u
 
     def advance(self, weights: Array, last: bool) -> None:
-        """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages."""
+        """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages.
+
+        `last` must be True at the last stage of a step. The state of a sampled compensator is not
+        changed.
+        """
         if not self.dt:
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
@@ -329,7 +341,7 @@ def decider(policy: object) -> object:
 
 
 def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
-    """Return the frame and the reference of a policy's states, or None for each unknown one."""
+    """Return the frame and the reference of a policy's states; each is None if it is unknown."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference

@@ -23,7 +23,7 @@ from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-# A time that exceeds the end time by at most this factor counts as the end, because sums of time
+# A time counts as the end if it is at most this factor times the end time, because sums of time
 # steps are rounded.
 AT_THE_END = 1.0 + 1e-9
 
@@ -202,10 +202,10 @@ class TrajectoryFeedback(Feedback):
 
 
 def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
-    """Return the policy to simulate.
+    """Prepare a policy for a simulation in which commands are held for `held` [s].
 
-    Its commands are held for `held` [s], or are continuous if `held` is 0. A gain schedule is
-    replaced by the feedback along its trajectory.
+    `held` is 0 if commands are not held. A gain schedule is replaced by the feedback along its
+    trajectory. If commands are held, a continuous linear controller is sampled.
     """
     if isinstance(policy, Allocation):
         return replace(policy, policy=followed(policy.policy, policy.design, held))
@@ -226,12 +226,12 @@ def tracking_of(policy: object) -> TrajectoryFeedback | None:
 
 @lru_cache(maxsize=2)  # saves half the time of a short run
 def largest_rate(schedule: GainSchedule) -> float:
-    """Return the 95th percentile over time of the largest pole magnitude [1/s].
+    """Return the 95th percentile over time of the magnitude [1/s] of the fastest closed-loop pole.
 
     Return 0 for a sampled schedule.
     """
     # The percentile excludes the short time at the end during which a large final weight makes K
-    # large. During this time, the integration step may be too long.
+    # large. An integration step that is based on the percentile may be too long for this time.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
@@ -314,7 +314,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
-        """Model of the robot at rest after the end, and the gain of the steady-state filter."""
+        """Model of the robot at rest after the trajectory, and gain of the steady-state filter."""
         lin, seen = self.end.discretize(self.filter.dt), self.filter
         return lin, kalman(lin, seen.W[-1], seen.V).L
 

@@ -385,7 +385,10 @@ def held_stages(
 
 
 def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
-    """Return the checked sampling time `sample` [s] of a design; 0 if it is None."""
+    """Return the sampling time `sample` [s], or 0 if it is None.
+
+    Raise `InputError` if `traj` is already sampled.
+    """
     expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
@@ -419,7 +422,10 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
 def steady_regulator(
     lin: LinearModel, Q: Array, R: Array, sample: float | None
 ) -> tuple[Array, Array]:
-    """Return the cost matrix P (nx, nx) and the gain K (nu, nx) about a steady point."""
+    """Return the cost matrix P (nx, nx) and the gain K (nu, nx) about a steady point.
+
+    If the inputs cannot stabilise the model, its `momentum_reduction` is regulated.
+    """
 
     def regulator(lin: LinearModel, Q: Array) -> Gain:
         if not sample:

@@ -96,7 +96,7 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
 
 
 def inverse_square(what: str, size: float) -> float:
-    """Return ``1 / size^2``, or raise `InputError` if `size` is not positive and finite."""
+    """Return ``1 / size^2``, or raise `InputError` if `size` is not between 1e-150 and 1e150."""
     if not 1e-150 <= size <= 1e150:
         raise InputError(f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150")
     return size**-2
@@ -253,11 +253,12 @@ def rule_weights(
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N by a rule, and a description of the rule.
 
-    Weights in `given` replace the weights of the rule.
+    Single weights in `given` replace the weights of the rule. If `given` names no rule, the rule
+    and the single weights in `Robot.weights` apply too, but `given` takes precedence.
     """
     # If a sampled model has a known continuous model, the rule gives a cost for the continuous
-    # model, which is converted to a sampled cost with held inputs. By default, the robot's
-    # `weights` name the rule. If the robot names no rule, the rule is "urdf".
+    # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
+    # the robot names a rule, the rule is "urdf".
     source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
     own = lin.weights if given.get("rule") is None else {}
@@ -318,9 +319,9 @@ def _of_regulated(
     terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
         S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Some inputs accelerate the wheels, but exert no force on the robot without its wheels.
-        # They form a null space. Inputs with coordinates n in this space accelerate the wheels by
-        # X n.
+        # The combinations of inputs in the null space of `forces` accelerate the wheels, but exert
+        # no force on the robot without its wheels. X maps coordinates in this null space to the
+        # accelerations of the wheels.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
         X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S

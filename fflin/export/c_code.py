@@ -225,7 +225,7 @@ class CLaw:
         self._step = getattr(_compiled(code, compiler), f"{self.name}_step")
 
     def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
-        return self._made, ()  # compiled again, since a loaded library cannot be copied
+        return self._made, ()  # compile again, because a loaded library cannot be copied
 
     def __repr__(self) -> str:
         about = self._about

@@ -49,10 +49,10 @@ class Case(NamedTuple):
 class Law:
     """Control law, converted to the tables of its C code, with test cases.
 
-    A state law is ``u = u0 - K (x - x0)``. Its tables have one row for all samples, or one row for
-    each sample. If there is a table `axis_points`, it contains a grid of joint positions, on which
-    K is interpolated. An output law is ``u = u0 + C z + D (y - y0)``. The next controller state z
-    is ``A z + B (y - y0)``.
+    A state law is ``u = u0 - K (x - x0)``. Its tables K, x0, u0 and `reference` have one row for
+    all samples, or one row for each sample. If there is a table `axis_points`, it contains a grid
+    of joint positions. K then has one row for each grid point, and is interpolated. An output law
+    is ``u = u0 + C z + D (y - y0)``. The next controller state z is ``A z + B (y - y0)``.
     """
 
     title: str
@@ -62,7 +62,8 @@ class Law:
     dt: float
     robot: Robot
     lin: LinearModel | None
-    tables: dict[str, Array]  # as in the C code; u0, low, high and continuous for all laws
+    # Tables of the C code, by name. Every law has the tables u0, low, high and continuous.
+    tables: dict[str, Array]
     operations: float  # bound on the number of rounded operations between an argument and a result
     cases: list[Case]
 
@@ -88,7 +89,8 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     lin = given._lin if isinstance(given, Gain) else getattr(given, "lin", None)
     if robot is None:
         robot = lin._robot if lin else getattr(getattr(given, "trajectory", None), "robot", None)
-    if robot is None:  # the law was read from a file, and the name may be a known robot
+    if robot is None:
+        # A law that was read from a file contains only the robot's name, which `load` may know.
         with suppress(FflinError):
             robot = load(lin.robot if lin else getattr(given, "robot", ""))
     if robot is None:
@@ -172,18 +174,18 @@ def _state_cases(
         x[:6] = 0.0
         turns = np.zeros(n)
         turns[turning] = random.integers(-3, 4, len(turning))
-        if index % 5 == 0:  # close to half a turn from the target, on either side
+        if index % 5 == 0:  # continuous joints close to half a turn from x0
             close = np.pi + random.choice([-1e-3, 1e-3], len(turning))
             x[6 + turning] = x0[6 + turning] + close
-        if axes and index % 4 == 0:  # at and beyond the ends of the grid
+        if axes and index % 4 == 0:  # joints at and beyond the ends of the grid
             for name, values in axes.items():
                 at = 6 + state.robot.joint_names.index(name)
                 x[at] = random.choice([values[0], values[-1], values[0] - 0.1, values[-1] + 0.1])
         q, v = state.to_pinocchio(x)
         turn: Array = random.normal(size=4)
-        if index % 7 == 0:  # close to half a turn from the reference
+        if index % 7 == 0:  # attitude close to half a turn from the reference
             turn[3] = (1e-3, -1e-3, 0.1, -0.1)[index % 4]
-        if index == 0 and (about[3:6] == 0.0).all() and not axes:  # exactly half a turn
+        if index == 0 and (about[3:6] == 0.0).all() and not axes:  # attitude: exactly half a turn
             turn = np.array((1.0, 0.0, 0.0, 0.0))
         turn = quaternion_product(about[3:], turn / norm(turn))
         q[3:7] = quaternion_product(conjugate(world.origin_quaternion), turn)

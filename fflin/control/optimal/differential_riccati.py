@@ -13,7 +13,8 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT
 
-# P is a cubic between knots. Knots are added until the cubic has this relative accuracy.
+# Between knots, P is a cubic of time. Knots are added until the estimated relative errors of the
+# integration and of the cubics are at most this.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 
@@ -137,7 +138,9 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
                 bend = rate(at_start, double) - rate(at_end, P)
                 between = 0.5 * (double + P) + 0.125 * (end - start) * bend
                 # The method has fourth order, so the error of two half steps is a fifteenth of
-                # their difference from one whole step. To be safe, a quarter is assumed.
+                # their difference from one whole step. The error of the cubics over the half
+                # intervals is a sixteenth of the error of the cubic over the whole interval. To be
+                # safe, a quarter is assumed in both cases.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
                 times += [middle, start]
@@ -150,7 +153,10 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
 
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
-    """Return K and P of all samples, the last sample first, and the largest relative residual."""
+    """Return K of all samples, P at all sample times, and the largest relative residual.
+
+    K and P begin with the last sample. The first P is the argument `P`.
+    """
     # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost matrix for the error at
     # the start of a sample and the input. The second (nx, nx + nu) maps this error and the input to
     # the next error.

@@ -15,9 +15,9 @@ from fflin.control.optimal.shooting import Point, Shooting
 _ENDS = 1e-8
 
 # Within the intervals, a limit applies only where it is needed. If an iterate exceeds the limit at
-# a point there by more than _LIMITED times the limit, the limit applies at this point and its
-# neighbours from then on. It is tightened by the fraction _TIGHTER, because the motion may exceed
-# it between the points.
+# a point within an interval by more than _LIMITED times the limit, the limit applies at this point
+# and its neighbours from then on. At these points, the limit is tightened by the fraction _TIGHTER,
+# because the motion may exceed the limit between the points.
 _LIMITED, _TIGHTER = 0.002, 0.005
 
 # If no gap between intervals exceeds this, the gaps count as closed, and the plan is integrated as
@@ -33,7 +33,7 @@ _NEARLY = 1e-3
 _SEEKS, _FLIES = 1e-6, 1e-8
 
 # The search ends after _MOST iterations. It ends earlier if an iteration adds no limit within the
-# intervals and the predicted reduction of the merit function is at most _SAVED times the function.
+# intervals and the predicted reduction of the merit function is at most _SAVED times its value.
 # The line search tries at most _MOST_HALVINGS step lengths. The gaps are closed in at most
 # _MOST_CLOSING iterations.
 _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
@@ -42,14 +42,14 @@ _SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 # other states. It is small, because wheels may turn far and fast.
 _OF_WHEELS = 1e-6
 
-# After each quadratic program, the violation of the goal and of the limits at the knots is computed
-# [rad or m]. The search fails if this violation stays above _HOPELESS for _STAGNANT iterations
-# without falling by a tenth. Smaller violations are due to the finite penalty, and vanish when the
-# gaps are closed.
+# After each quadratic program, the predicted violations of the goal and of the limits at the knots
+# are summed [rad, m, s]. The search fails if this sum stays above _HOPELESS for _STAGNANT
+# iterations without falling by a tenth. Smaller violations are due to the finite penalty, and
+# vanish when the gaps are closed.
 _STAGNANT, _HOPELESS = 10, 1e-2
 
-# Penalty for a violation of the goal or a limit by 1 rad or 1 m. The cost of the initial guess
-# is 1.
+# Cost of a violation of the goal or a limit, per unit of the sum of violations [rad, m, s]. For
+# comparison, the effort of the initial guess costs 1/2.
 _PRICE = 1e3
 
 
@@ -59,7 +59,7 @@ class Trial(NamedTuple):
     q: Array  # (N + 1, nq)
     v: Array  # (N + 1, nv)
     u: Array  # (N + 1, nu)
-    missed: Array  # (N, nx)
+    missed: Array  # gaps between intervals (N, nx)
     knots: Array  # how far the knots may move down and up (2, N + 1, nx)
     inside: Array  # the same for points within intervals (2, N, parts - 1, nx)
 
@@ -69,7 +69,10 @@ class Trial(NamedTuple):
         return float(np.abs(self.missed).max())
 
     def outside(self, limited: Mask) -> float:
-        """Return the sum of limit violations at knots, and at the points in the mask `limited`."""
+        """Return the sum of the violations of the goal and the limits.
+
+        Limits are checked at the knots, and at the points within intervals in the mask `limited`.
+        """
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
 
@@ -88,7 +91,7 @@ class Search(NamedTuple):
     limits: Array  # limits of inputs (2, nu)
     size: Array  # magnitudes of the limits of states (nx,), 0 for states without limits
     cost: Array  # weights of squared inputs (N + 1, nu)
-    parts: int  # number of parts per interval, at whose ends states are limited
+    parts: int  # number of equal parts per interval; limits can apply at the end of each part
     report: Callable[[str], None]  # receives a line of text in each iteration
 
     def best(self, q: Array, v: Array, u: Array) -> Trial:
@@ -150,7 +153,7 @@ class Search(NamedTuple):
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
 
     def _exceeding(self, trial: Trial) -> Mask:
-        """Return a mask (N, parts - 1, nx): values that exceed a limit, and their neighbours."""
+        """Return a mask (N, parts - 1, nx) of values that exceed a limit, and their neighbours."""
         beyond: Mask = excess(trial.inside) > (_LIMITED + _TIGHTER) * self.size
         near = beyond.copy()
         near[:, 1:] |= beyond[:, :-1]
@@ -202,7 +205,8 @@ class Search(NamedTuple):
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals by the smallest steps of the knots and the inputs.
 
-        If a gap remains, return the motion under the last inputs.
+        The steps also remove the violations of the goal and the limits. If a gap remains, return
+        the motion under the last inputs.
         """
         shooting, last = self.shooting, _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
@@ -269,8 +273,9 @@ def solve_stages(
 
     `ends` (N, nx, nx + 2 nu) contains A, B and D side by side; D is zero if inputs are held. `cost`
     and `g` (N + 1, nx + nu) have one row for each knot, and no entry of `cost` is negative.
-    `limits` (2, N + 1, nu) contains low and high. `rows` has a column for each entry of w. The
-    program is scaled by `scale` (nx + nu,), the typical sizes of the entries of x and u.
+    `limits` (2, N + 1, nu) contains low and high. `rows` has a row for each soft limit, and a
+    column for each entry of w. The program is scaled by `scale` (nx + nu,), the typical sizes of
+    the entries of x and u.
 
     Return x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
     Return None if the program is infeasible or the solver fails.

@@ -27,7 +27,7 @@ _APART = 1e-5
 
 # A pole is near the stability boundary if its distance from the boundary, relative to the largest
 # pole magnitude, is below this. An undamped mode without weight in Q has its pole exactly on the
-# boundary, but rounding errors move the computed pole by such a distance.
+# boundary, but rounding errors move the computed pole by up to this distance.
 _NEAR_BOUNDARY = 1e-6
 
 
@@ -86,7 +86,7 @@ class Riccati:
             self.cross = None if N is None else dtrtrs(self.R_factor, N.T, lower=1)[0]
 
     def gain(self, P: Array) -> Array:
-        """Return K (nu, nx), u = -K x."""
+        """Return the gain K (nu, nx) of the feedback u = -K x, from P (nx, nx)."""
         factor, Y = self._factored(P)
         return dtrtrs(factor, Y, lower=1, trans=1)[0]
 
@@ -126,10 +126,11 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Return the stabilising solution; use SciPy only if the half-size method is inaccurate.
+    """Return the stabilising solution of an algebraic Riccati equation.
 
-    Raise `LinAlgError` if SciPy fails too. Newton's method refines the solution (D. L. Kleinman,
-    IEEE Trans. Automatic Control 13(1), 1968).
+    SciPy is used only if the half-size method fails or is inaccurate. If SciPy fails too, raise
+    `LinAlgError`. Newton's method refines the solution (D. L. Kleinman, IEEE Trans. Automatic
+    Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -164,7 +165,11 @@ def half_size(
 
 
 def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
-    """Solve by the half-size method. Scale the rows and columns of Q for rates by 1 + `apart`."""
+    """Solve by the half-size method, or return None if the method fails.
+
+    Newton's method starts from the loop of a modified Q: the rows and columns of the velocities are
+    multiplied by 1 + `apart`.
+    """
     found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
@@ -193,9 +198,9 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    """Return the continuous equation (10.6) with the same P.
+    """Convert a sampled equation to the continuous equation (10.6) with the same solution P.
 
-    Return None if R of this equation is not positive definite.
+    Return None if R of the continuous equation is not positive definite.
     """
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
@@ -248,7 +253,8 @@ def _refined(
                 break
         elif gain < 10.0:
             # Progress is slow if the modes belong to a loop that differs too much from the loop of
-            # the current P. New modes are then computed.
+            # the current P. New modes are then computed. If the modes were computed here before,
+            # and the latest step was still rejected, the refinement ends.
             if fresh and trial is not better:
                 break
             modes = None
@@ -256,7 +262,7 @@ def _refined(
 
 
 def _general(equation: Riccati, unit: bool) -> Array:
-    """Solve with SciPy.
+    """Return the solution P from SciPy.
 
     If `unit` is True, scale the inputs so that R is I, because SciPy treats a badly scaled R as
     singular.
@@ -295,12 +301,12 @@ class ModalMatrix:
         return cls(V, poles, discrete)
 
     def lyapunov(self, r: Array) -> Array:
-        """Solve F' D + D F = -r (discrete: F' D F - D = -r) for a symmetric r (n, n)."""
+        """Return D with F' D + D F = -r (discrete: F' D F - D = -r); r (n, n) must be symmetric."""
         return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
 
     def lyapunov_modal(self, r: Values) -> Array:
-        """Solve the equation of `lyapunov`, with r given as V^H r V."""
-        # In modal coordinates, each entry of the solution is the same entry of r times a factor.
+        """Return the same D as `lyapunov`, but from r in modal coordinates, which is V^H r V."""
+        # In modal coordinates, each entry of D is the corresponding entry of r times a factor.
         D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
         return 0.5 * (D + D.T)
 

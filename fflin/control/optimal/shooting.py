@@ -113,7 +113,10 @@ class Shooting:
         return self.limited_values(*(each[:, every::every] for each in motions))
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
-        """Set the number of steps so that interval ends have the given accuracy [rad, m, s]."""
+        """Double the number of steps until the interval ends have the given accuracy [rad, m, s].
+
+        The number of steps is at most _MOST_STEPS.
+        """
         self.steps = _FEWEST_STEPS
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
@@ -130,8 +133,8 @@ class Shooting:
         at the next knot. The second array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of
         the points that divide each interval into equal parts.
         """
-        # Integrate dZ/dt = A Z + B along the motions by Runge-Kutta steps. Z contains the Jacobians
-        # of all intervals.
+        # Integrate dZ/dt = A Z + `driven` along the motions by Runge-Kutta steps. Z contains the
+        # Jacobians of all intervals, and `driven` contains B for the inputs at both knots.
         N, nx, nu = len(self.h), len(self._size), u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
