@@ -15,10 +15,10 @@ from fflin.base.writing import as_path, missing, shown
 class RobotFile(NamedTuple):
     """Location of a robot's description."""
 
-    name: str  # name for `load`
-    path: Path  # path of the URDF
+    name: str  # name in the catalogue, or stem of the file
+    path: Path  # URDF, xacro or TOML file
     origin: str  # "fflin", "example-robot-data" or "file"
-    package_dirs: tuple[Path, ...] = ()  # folders in which ``package://`` meshes are searched
+    package_dirs: tuple[Path, ...] = ()  # folders in which meshes are searched
 
 
 @cache
@@ -42,8 +42,8 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
     found = {}
     for name, loader in ROBOTS.items():
-        # example-robot-data builds talos_legs in code from another robot, so talos_legs has no
-        # URDF.
+        # The loader of talos_legs inherits the URDF of another robot, and removes joints in code.
+        # Therefore talos_legs has no URDF of its own.
         if loader.urdf_filename and name != "talos_legs":
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
@@ -72,7 +72,9 @@ def list_robots() -> tuple[str, ...]:
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by its name, or by the path of its file; a relative path starts at `folder`.
 
-    Bundled names take precedence over paths, and paths over names in example-robot-data.
+    The name of a bundled URDF takes precedence over a path, and the path of a file over a name in
+    example-robot-data. The name of a bundled TOML file, such as "inspector.toml", is used only if
+    no file has this path.
     """
     instance("robot", robot, (str, os.PathLike), "a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():

@@ -50,8 +50,8 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
-    # A limit of the whole group q_m or qdot_m does not apply to wheels, because wheels rotate much
-    # faster than joints.
+    # A limit of the whole group q_m or qdot_m does not apply to wheels, because wheels have
+    # unbounded angles, and rotate much faster than joints.
     groups: Sequence[str] = ("q_m", "qdot_m")
     wheels = {f"{x}.{own[0]}" for item, own in named if item.GROUP == "wheel" for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
@@ -129,7 +129,10 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
 
 
 def _weights(value: object, robot: Robot) -> dict[str, object]:
-    """Return checked weights of the regulator; their keys are names of states and inputs."""
+    """Return the checked weights of `lqr`: the rule, and the mappings q, r and bryson.
+
+    The keys of the mappings are names, groups or patterns of states and inputs.
+    """
     states, inputs = state_keys(robot.joint_names), _input_keys(robot)
     both = (*states, *inputs)
     kinds = {"q": ("state", states), "r": ("input", inputs), "bryson": ("state or input", both)}
@@ -186,9 +189,9 @@ _OPEN: Range = (-math.inf, math.inf)
 
 def limits_of(robot: Robot) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
-    # Start with the limits of the URDF. A limit of zero counts as no limit, because exporters write
-    # 0 for unknown limits. Limits of the inputs replace limits of the URDF, and `Robot.limits`
-    # replaces limits of the URDF and of the inputs.
+    # Start with the limits of the URDF. Equal lower and upper limits, such as 0 and 0, count as no
+    # limit, because exporters write 0 for unknown limits. Limits of the inputs replace limits of
+    # the URDF, and `Robot.limits` replaces limits of the URDF and of the inputs.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         low, high = travel_of(robot.model, joint)
@@ -231,7 +234,7 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
 
 
 def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
-    """Return the thrusters that fire in pulses, as {index of the input: (name, thruster)}."""
+    """Return the thrusters with `on_off` or `least_impulse`, as {index in u: (name, thruster)}."""
     inputs = ((name, item) for item, names in robot.named_inputs for name in names)
     return {
         index: (name, item)
@@ -241,7 +244,7 @@ def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:
-    """Return {input or state: magnitude} for all limits whose magnitude is finite and not zero.
+    """Return {input or state: magnitude} for all limits whose magnitude is finite and positive.
 
     The magnitude of limits (least, largest) is
 
@@ -258,8 +261,9 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
     """Return the limits that the argument `limits` selects.
 
-    The text "urdf" in `limits` selects all limits of the robot. Every other entry of `limits` is
-    itself a limit. It replaces the robot's limit of the same input or state.
+    `limits` is None, "urdf", one limit for all inputs, limits by name, or a list of these that
+    contains "urdf". The text "urdf" selects all limits of the robot. A limit given in `limits`
+    replaces the robot's limit of the same input or state.
     """
     own, given = dict[str, Range](), dict[str, Range]()
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)

@@ -31,18 +31,18 @@ T = TypeVar("T")
 class Joint(NamedTuple):
     """Joint with one degree of freedom."""
 
-    name: str  # in the model
+    name: str  # name in the model
     idx_q: int = 0  # index of its first entry in Pinocchio's q
     idx_v: int = 0  # index of its entry in Pinocchio's v
     unbounded: bool = False  # continuous: two entries (cos, sin) of q, but one angle in the state
-    prismatic: bool = False  # position is a length [m] instead of an angle [rad]
+    prismatic: bool = False  # its entry of q is a length [m] instead of an angle [rad]
     # "joint", "slosh" for a coordinate of a sloshing mass, or "modal" for a modal amplitude.
     kind: str = "joint"
     scale: float = 1.0  # entry of q per unit of q_m; 1 except for modal amplitudes
     # Generalised inertia of a mode while its link is fixed in space; 1 for a modal amplitude.
     inertia: float = 1.0
-    # Largest rotation [rad] of the appendage or slosh mass per unit of the mode's coordinate; 0 if
-    # the mode only translates.
+    # Upper bound of the rotation [rad] of the appendage or slosh mass per unit of the mode's
+    # coordinate; 0 if the mode causes no rotation.
     rotation: float = 0.0
 
     @property
@@ -66,7 +66,7 @@ class Joint(NamedTuple):
         return omega, 0.5 * damping / (self.inertia * omega)
 
     def place(self, q: Array, value: float | Array) -> None:
-        """Write this joint's value [rad|m|kg^0.5 m] into a configuration q (nq,)."""
+        """Write this joint's value [rad|m|kg^0.5 m] into configurations q (nq, ..)."""
         if self.unbounded:
             q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
         else:
@@ -196,10 +196,11 @@ class Coordinates:
             joint.place(q, multiplier * leader.values(q) + offset)
 
     def checked_configuration(self, q: ArrayLike) -> Array:
-        """Return q (nq,) with small errors corrected; raise `InputError` for errors above 1e-6.
+        """Return q (nq,) with small errors corrected; raise `InputError` for larger errors.
 
-        The lengths of the base quaternion and of each pair (cos, sin) are corrected to 1. The
-        mimic joints are corrected to the positions that follow from their leaders.
+        The base quaternion and each pair (cos, sin) are scaled to length 1 if the squared length
+        differs from 1 by at most 1e-6. Mimic joints that deviate by at most 1e-6 are corrected to
+        the positions that follow from their leaders.
         """
         near = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
         if not pin.isNormalized(self.model, near, ROUND_OFF):

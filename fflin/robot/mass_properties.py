@@ -35,13 +35,13 @@ _SYMMETRIC = 1e-9
 # relative rounding error of a principal moment of inertia, and of a second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
-# Singular values below this fraction of the largest one count as zero. The fraction is above the
-# rounding errors of about 1e-15, and below the smallest nonzero value of about 1e-7, which occurs
-# for links that are 1e7 m apart.
+# In `idle_coordinates`, singular values below this fraction of the largest one count as zero. The
+# fraction is above the rounding errors of about 1e-15, and below the smallest nonzero value of
+# about 1e-7, which occurs for links that are 1e7 m apart.
 _ZERO = 1e-12
 
-# A message about motions without kinetic energy names the coordinates that take part in them: the
-# norm of their components in an orthonormal basis of these motions exceeds this value.
+# A coordinate takes part in motions without kinetic energy if the norm of its components in an
+# orthonormal basis of these motions exceeds this value.
 _INVOLVED = 0.1
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
@@ -170,7 +170,7 @@ class LinkMass(NamedTuple):
 
     mass: float
     inertia: Array
-    placement: pin.SE3  # placement of the <inertial> on the link
+    placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the link
 
 
 def link_mass(body: pin.Inertia) -> LinkMass:
@@ -185,7 +185,7 @@ class Piece(NamedTuple):
     placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
     mass: float
     inertia: Array
-    frame: pin.SE3  # placement on the joint of the frame in which the centre of mass is given
+    frame: pin.SE3  # placement of the link's frame on the joint; identity for a whole body
     body: str  # name of the whole body: its joint, or "base"
     whole: bool = False  # whether the piece is a body of several links
 
@@ -249,11 +249,12 @@ def as_inertia(piece: Piece) -> pin.Inertia:
 
 
 def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
-    """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one link.
+    """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one piece.
 
-    `mass` (N,) is a relative change of the link's mass by a point mass at the centre of mass, which
-    does not change the inertia about this point. The other arguments are as in `_stretched`, with
-    the components of `inertia` and `com` along the axes of the link.
+    The changes by `density`, `com` and `inertia` are as in `_stretched`, with components along the
+    axes of `piece.frame`. Then, a point mass is added at the centre of mass, which does not change
+    the inertia about this point. `mass` (N,) is the ratio of the point mass to the changed mass of
+    the piece.
     """
     body = as_inertia(piece)
     after = _stretched(body, piece.frame.rotation, density, com, inertia)

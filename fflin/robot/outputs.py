@@ -278,7 +278,10 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Parse outputs from a text such as WORD, joints:NAME, pose:NAME or relative:NAME:TO."""
+    """Parse outputs from a text such as WORD, joints:NAME, pose:NAME or relative:NAME:TO.
+
+    The text frame:NAME stands for the pose and the velocity of a frame.
+    """
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     require_known("output", [word], kinds)

@@ -136,7 +136,8 @@ class Robot(Coordinates):
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
     appendages: tuple[Appendage, ...] = ()
-    # The same robot without wheels and modes; None if no joint is a wheel or mode.
+    # The robot without the joints of wheels and modes; None if no joint is a wheel or mode. Its
+    # fields such as `inputs` and `stiffness` may be outdated.
     _unequipped: Robot | None = None
 
     def __post_init__(self) -> None:

@@ -109,9 +109,10 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
 
 
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
-    """Return a robot with the base of another robot welded to a frame.
+    """Return `robot` with the base of `other` welded to the frame `frame` of `robot`.
 
-    The joints and frames of the other robot get the names PREFIX.NAME. No inputs act on its joints.
+    `placement` is the placement of this base in the frame. The joints and frames of `other` get the
+    names PREFIX.NAME. No inputs act on its joints.
     """
     bare = robot._bare
     if not prefix or "." in prefix:
@@ -131,7 +132,8 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
-    if not other.links:  # a single body, whose mass properties get the name of the prefix
+    # If `other` was not read from a URDF, its base becomes a link with the name `prefix`.
+    if not other.links:
         both["links"][prefix] = link_mass(other.model.inertias[ROOT])
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     bare = replace(

@@ -7,11 +7,11 @@ participation L (6, k). Its kinetic energy is
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
 Each mode is modelled by a ball on a screw joint, see (16.4) of docs/derivation.md. The ball is a
-rigid body with the spatial inertia ``I``, and moves by the twist ``S`` per unit amplitude. Its
-momentum ``I S`` is the mode's column of L. Its modal mass is ``S^T I S`` = 1. If the link is too
-light for this ball, a lighter ball is used. Its ``S^T I S`` exceeds 1, and a negative rotor inertia
-of the joint reduces the modal mass to 1. The inertia of the ball is subtracted from the inertia of
-the link. Therefore, the link and its balls together have the inertia in the URDF.
+rigid body with the spatial inertia ``I``. At unit modal rate, the ball has the twist ``S`` and the
+momentum ``I S``, which is the mode's column of L. The modal mass is ``S^T I S`` = 1. If the link is
+too light for this ball, a lighter ball is used, whose ``S^T I S`` exceeds 1. A negative rotor
+inertia of the joint then reduces the modal mass to 1. The inertia of the ball is subtracted from
+the inertia of the link. Therefore, the link and its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class FlexibleAppendage(FrozenArrays):
     damping: Any = 0.005
     name: str | None = None
     # Rigid inertia M_rr (6, 6) from a file, about the frame's origin, with translation before
-    # rotation. If `rigid` is true, this inertia replaces the inertia in the URDF.
+    # rotation. If `rigid` is true, M_rr replaces the inertia of the link `frame`. If `frame` is not
+    # a link, M_rr replaces the inertia of the whole body that carries the frame.
     inertia: Array | None = field(default=None, kw_only=True)
     rigid: bool = field(default=False, kw_only=True)
 
@@ -443,7 +444,7 @@ Appendage: TypeAlias = FlexibleAppendage | Slosh
 def rigid_inertia(M: Array) -> pin.Inertia:
     """Convert a rigid-body mass matrix (6, 6), with translation before rotation, to an inertia."""
     # Pinocchio's parameters are the mass, the mass times the centre of mass (x, y, z), and the
-    # moments of inertia in the order xx, xy, yy, xz, yz, zz.
+    # inertia about the origin in the order xx, xy, yy, xz, yz, zz.
     entries = M[[0, 1, 2, 0, 3, 3, 4, 3, 4, 5], [0, 5, 3, 4, 3, 4, 4, 5, 5, 5]]
     return pin.Inertia.FromDynamicParameters(entries)
 

@@ -1,12 +1,12 @@
 r"""Equipment of a robot: reaction wheels, flexible appendages and slosh, as joints of its model.
 
 Each mode of a flexible appendage is modelled by a ball on a screw joint, see (16.4) of
-docs/derivation.md. The ball is a rigid body with the spatial inertia ``I``, and moves by the twist
-``S`` per unit amplitude. Its momentum ``I S`` is the mode's column of the modal participation L
-(6, k). Its modal mass is ``S^T I S`` = 1. If the link is too light for this ball, a lighter ball is
-used. Its ``S^T I S`` exceeds 1, and a negative rotor inertia of the joint reduces the modal mass to
-1. The inertia of the ball is subtracted from the inertia of the link. Therefore, the link and its
-balls together have the inertia in the URDF.
+docs/derivation.md. The ball is a rigid body with the spatial inertia ``I``. At unit modal rate, the
+ball has the twist ``S`` and the momentum ``I S``, which is the mode's column of the modal
+participation L (6, k). The modal mass is ``S^T I S`` = 1. If the link is too light for this ball, a
+lighter ball is used, whose ``S^T I S`` exceeds 1. A negative rotor inertia of the joint then
+reduces the modal mass to 1. The inertia of the ball is subtracted from the inertia of the link.
+Therefore, the link and its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -32,19 +32,21 @@ from fflin.robot.urdf.description import is_impossible
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-# Rounding errors can make an eigenvalue of M_rr - L L^T negative. A negative eigenvalue is accepted
-# if its magnitude is at most this fraction of the largest eigenvalue of M_rr.
+# For the rigid inertia M_rr (6, 6) of a body, M_rr - L L^T must be positive semidefinite. A
+# negative eigenvalue counts as a rounding error if its magnitude is at most this fraction of the
+# largest eigenvalue of M_rr.
 _NEGATIVE = 1e-9
-# A warning is issued if the inertia in an appendage's file differs from the inertia in the URDF by
-# more than this fraction.
+# A warning is issued if an entry of the rigid inertia (6, 6) in an appendage's file differs from
+# the URDF by more than this fraction of the mass. The unit of length in this comparison is the
+# radius of gyration.
 _AGREE = 1e-2
-# Largest total mass of the balls on a body, as a fraction of the body's mass. The remaining mass
-# must be positive, because CRBA adds inertias from the tips of the tree to the base, and each sum
-# must have a positive mass.
+# Largest total mass of the balls on a body, as a fraction of the body's mass without sloshing
+# liquid. The remaining body must have a positive mass, because CRBA adds the inertias of its
+# children to it one by one, and each partial sum must have a positive mass.
 _LARGEST_SHARE = 0.9
-# A displacement of a ball counts as a rotation of its appendage about the appendage's frame only if
-# the distance of the ball from this frame is at least this fraction of the body's radius of
-# gyration.
+# The displacement of a ball is converted to a rotation of the appendage about the origin of its
+# frame only if the ball is far enough from this origin. The least distance is this fraction of the
+# body's radius of gyration.
 _SHORTEST = 0.05
 # Least mass of a ball, as a fraction of the mass mu that satisfies (16.4) without a rotor inertia.
 _LIGHTEST = 1e-6
@@ -53,8 +55,8 @@ _LIGHTEST = 1e-6
 # the translation is multiplied by a length, such as the radius of gyration of the body.
 _NONE = 1e-14
 
-# Fields of a robot that have joint names as keys. A key may also be GROUP.JOINT, with a group of
-# _GROUPS.
+# Fields of a robot that have joint names as keys, possibly in nested mappings. A key may also have
+# the form GROUP.JOINT, where GROUP is one of _GROUPS.
 _BY_NAME = (
     *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
     *("point", "target", "start"),
@@ -141,8 +143,8 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     for item in given:
         if not isinstance(item, FlexibleAppendage) or item.inertia is None:
             continue
-        # The file's inertia is compared with the link at the frame, or with the whole body if the
-        # frame is not a link.
+        # The inertia `of_file` is compared with the inertia `own`, or replaces it. `own` belongs to
+        # the link `item.frame`, or to the whole body if this frame is not a link.
         joint, placement = find_frame(bare.model, item.frame)
         body, what = bare.model.inertias[joint], f"the body with frame '{item.frame}'"
         of_file, own, links = rigid_inertia(item.inertia), body, bare.links
@@ -301,7 +303,7 @@ def _carrier_name(model: pin.Model, joint: int) -> str:
 
 
 def turned_to(axis: Array) -> Array:
-    """Return a rotation matrix (3, 3) that maps z to an axis.
+    """Return a rotation matrix (3, 3) that maps z to `axis` (3,), which must have unit length.
 
     The matrix has no rounding errors if the axis is x, y or z.
     """
@@ -421,11 +423,12 @@ def _radius_of_gyration(body: pin.Inertia) -> float:
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
     """Return the least eigenvalue (N,) of M_rr - L L^T, divided by the largest eigenvalue of M_rr.
 
-    M_rr is computed from the masses (N,), the centres of mass (N, 3), and the inertias (N, 3, 3)
-    about these centres.
+    M_rr is computed for N variants of a body from the masses (N,), the centres of mass (N, 3), and
+    the inertias (N, 3, 3) about these centres. L (6, k) is about the origin of the joint. The
+    result is -inf for a variant with values that are not finite.
     """
-    # Here, M_rr and the modes are about the centre of mass. The unit of length is the radius of
-    # gyration.
+    # In `M` and `modes`, moments are about the centre of mass, and the unit of length is the radius
+    # of gyration `size`.
     trace = np.trace(inertia, axis1=1, axis2=2)
     size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
     t, r = np.split(L, 2)
@@ -462,17 +465,18 @@ def _ball(
 ) -> Mounted:
     """Return the ball that models a mode by (16.4).
 
-    `column` (6,) is the mode's participation about the body's origin. `p` (3,) is the origin of the
-    appendage's frame. `lighter` is the mass of the ball, as a fraction of the mass mu in (16.4). If
-    `lighter` is 1, the joint needs no rotor inertia.
+    In the frame of the joint `joint`, `column` (6,) is the participation of the mode, and `p` (3,)
+    is the origin of the appendage's frame. `lighter` is the mass of the ball, as a fraction of the
+    mass mu in (16.4). If `lighter` is 1, the joint needs no rotor inertia.
     """
-    # Compute the participation (t, r) about the origin of the appendage's frame. About this point,
-    # a mode that only translates has r = 0.
+    # Convert the participation (t, r) back to the origin of the appendage's frame. There, r = 0 if
+    # the `rotation` of the appendage is zero for this mode.
     t, r, size = column[:3], column[3:] - np.cross(p, column[:3]), _radius_of_gyration(body)
     square, center = float(t @ t), np.zeros(3)
     if math.sqrt(square) * size > _NONE * math.hypot(*r):
         center = np.cross(t, r) / square
-        # Limit the distance of the ball from the frame to the body's radius of gyration.
+        # Place the ball at most one radius of gyration of the body from the origin of the
+        # appendage's frame.
         center *= min(1.0, size / max(math.hypot(*center), 1e-300))
     else:
         t, square = np.zeros(3), 0.0
@@ -482,10 +486,10 @@ def _ball(
         r, rest = np.zeros(3), 0.0
     moment = rest**2 + size**2 * square if rest else 0.0
     mass = square + (rest / size) ** 2 if square else 0.0
-    # Bound the rotation of the appendage for a unit amplitude. The ball rotates by
-    # |w| = |r| / moment. Its centre moves by |v| = |t| / mass, which is a rotation by at most
-    # |v| / lever about the appendage's frame, because `lever` is the distance of the centre from
-    # this frame. The bound is the sum |w| + |v| / lever.
+    # Bound the rotation of the appendage for a unit amplitude. The ball rotates by |r| / moment.
+    # Its centre moves by |t| / mass, at the distance `lever` from the origin of the appendage's
+    # frame. This is a rotation by at most |t| / mass / lever about this origin, which is neglected
+    # if `lever` is too short. The bound does not depend on `lighter`, because `mass` is still mu.
     rotation = rest / moment if moment else 0.0
     if mass and lever >= _SHORTEST * size:
         rotation += math.sqrt(square) / mass / lever
@@ -499,8 +503,9 @@ def _ball(
     else:
         axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
         origin, motion = center, pin.JointModelPZ()
-    # If the ball is lighter than the mass mu in (16.4), S^T I S exceeds 1. A negative rotor inertia
-    # restores the modal mass of 1: S^T I S + rotor = 1.
+    # The modal mass of 1 is the sum of S^T I S, which is t @ v + r @ w, and of the rotor inertia
+    # `rotor`. If the mass of the ball is less than mu in (16.4), S^T I S exceeds 1, and `rotor` is
+    # negative. If the participation is zero, S = 0 and `rotor` = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)

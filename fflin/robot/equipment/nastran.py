@@ -23,9 +23,10 @@ MASSES = {
 # Names of the mass matrix and of the stiffness matrix in the files of different programs.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
 
-# Values up to this fraction of the largest value of a matrix count as rounding errors. A file is
-# refused if one of these values is larger: the asymmetry of a matrix, the stiffness that couples
-# the boundary to the modes, or the stiffness that resists a rigid motion.
+# Tolerance for rounding errors, relative to the largest entry of the matrix. It applies to the
+# asymmetry of the mass and stiffness matrices, and to the stiffness that couples the boundary to
+# the modes. For the stiffness that resists rigid motions, the tolerance is relative to `size` in
+# `read_superelement`.
 _SHARE = 1e-6
 
 
@@ -64,7 +65,8 @@ def read_superelement(
         squares, shapes = eigh(K[np.ix_(inner, inner)], M[np.ix_(inner, inner)])
     except LinAlgError:
         squares = np.zeros(1)
-    # The modes must be independent, and the structure must be clamped only at the boundary.
+    # The modes must be independent and clamped at the boundary. The structure must not be clamped
+    # elsewhere, and its mass must be positive.
     faults = {
         "the stiffness matrix couples boundary and modes; expected modes that are clamped at the "
         "boundary (Craig-Bampton)": np.abs(coupling).max() > _SHARE * np.abs(K).max(),
@@ -95,7 +97,7 @@ def _read_as(path: Path, kind: str) -> Iterator[None]:
         yield
     except ImportError:
         raise InputError("Nastran files need pyYeti: pip install 'fflin[nastran]'") from None
-    except Exception as error:  # pyYeti raises whatever its parsing meets
+    except Exception as error:  # pyYeti may raise any error
         raise InputError(f"{path} cannot be read as {kind}: {reason(error)}") from None
 
 
@@ -104,11 +106,11 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
 
     The mask (m,) is true for the degrees of freedom of the boundary, and false for the modes. The
     columns of the rigid motions (m, 6) are unit translations and rotations about the basic origin.
-    The positions (grids, 3) are in basic coordinates.
+    The positions (grids, 3) are in basic coordinates, in the file's unit of length.
     """
     punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file() and "pv_only"
     with _read_as(path, "the assembly file (.asm) of an external superelement"):
-        with np.printoptions():  # pyYeti changes them for the whole process
+        with np.printoptions():  # importing pyYeti changes these options
             from pyyeti import nastran
         # A .pch file lists the degrees of freedom that each grid point retains. Without this file,
         # each grid point retains all six.

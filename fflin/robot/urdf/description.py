@@ -101,7 +101,7 @@ class JointElement(NamedTuple):
     origin: Pose  # placement of the child's frame in the parent's frame
     mimic: Mimic | None  # as in the file, where the leader may be a mimic joint too
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # in the child's frame, of any length
-    limits: dict[str, float] | None = None  # given lower, upper, effort, velocity
+    limits: dict[str, float] | None = None  # lower, upper, effort and velocity, if given
     damping: float = 0.0  # [N m s/rad | N s/m]
     friction: float = 0.0  # [N m | N]
 
@@ -167,8 +167,8 @@ def read_joint(name: str, element: Element) -> JointElement:
         numbers = found.number("multiplier", 1.0), found.number("offset", 0.0)
         mimic = Mimic(found.text("joint"), *numbers)
     joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
-    # Only a joint with one degree of freedom needs an axis. For all other joints, exporters may
-    # write an axis of zeros, so do not check it.
+    # Read the axis, dynamics and limits only of joints with one degree of freedom. Do not check the
+    # axis of any other joint, because exporters may write an axis of zeros.
     if FREEDOM[kind] != 1:
         return joint
     if found := element.find("axis", "xyz"):
@@ -254,8 +254,8 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     root.refuse_near_miss("link", "joint")
-    # Find links and joints that are in the wrong place. Recognise them by their children, because
-    # extensions of URDF may use the same tags for elements with other children.
+    # Find robots, links and joints that are in the wrong place. Recognise them by their children,
+    # because extensions of URDF may use the same tags for elements with other children.
     marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
     for child in root.children:
         for inner in (child, *child.iterate()):
@@ -338,9 +338,9 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
 
     `moments` are sorted in increasing order.
     """
-    # A body whose mass is within the radius r of its centre has moments of at most mass * r^2.
-    # A negative moment is a rounding error of a point mass if its magnitude is at most this bound
-    # with r = _POINT.
+    # A negative moment counts as a rounding error in two cases: it is small compared with the
+    # largest moment, or the body may be a point mass. If all mass is within the distance _POINT of
+    # the centre of mass, no moment exceeds mass * _POINT^2.
     return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 

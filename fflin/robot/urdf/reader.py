@@ -33,8 +33,8 @@ _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 # Time limit [s] for the expansion of a xacro file, whose expressions and macros may never end.
 XACRO_LIMIT = 60.0
 
-# Path of the program that expands xacro. Python runs it as a file: with the option -m or -c, the
-# program could import modules from the working folder.
+# Path of the program that expands xacro. Python runs it as a file, because the option -m would
+# first import fflin.
 _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
 # These elements do not affect the model, so a "${" inside them does not require xacro.
@@ -166,8 +166,8 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
         if kind in ("revolute", "prismatic") or joint.limits:
             inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
         parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
-    # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. For version 1.2 or
-    # higher, urdfdom would require limits.
+    # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. In version 1.2, the
+    # lower and upper limits of revolute and prismatic joints would be mandatory.
     return _tag("robot", {"name": name, "version": "1.1"}, "\n".join(parts))
 
 

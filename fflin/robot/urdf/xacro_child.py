@@ -14,7 +14,8 @@ def main(path: str, limit: float) -> None:
     import json
     from pathlib import Path
 
-    faulthandler.dump_traceback_later(limit, exit=True)  # even if its parent has ended
+    # End this process at the time limit, even if the parent process has ended.
+    faulthandler.dump_traceback_later(limit, exit=True)
     import xacro
     from xacrodoc import XacroDoc, packages
 

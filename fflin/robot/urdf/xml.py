@@ -22,7 +22,7 @@ _TAG_LIMIT = 2**20  # bytes
 # No physical value is larger than this, and the product of two such numbers does not overflow.
 _LARGEST = 1e30
 
-# Least similarity (0 to 1) at which an unknown name counts as misspelt. For example, "xzy" is
+# Least similarity (0 to 1) at which an unknown attribute counts as misspelt. For example, "xzy" is
 # similar to "xyz", and "quat" to "quat_xyzw", but "unit" is not similar to "value".
 _NEAR = 0.6
 
@@ -44,7 +44,7 @@ def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
 class Element:
     """XML element; its text content is not stored, because URDF uses only attributes."""
 
-    tag: str  # includes a prefix, which need not be bound to a namespace
+    tag: str  # may include a prefix, which need not be bound to a namespace
     attributes: dict[str, str]
     line: int  # line of its start tag
     origin: str  # name of the document in errors: the path of the file
@@ -134,7 +134,11 @@ class Element:
         return value
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Return an attribute as a decimal number with a magnitude of at most 1e30."""
+        """Return an attribute as a decimal number; return `default` if it is missing.
+
+        Raise `UrdfError` if the attribute is missing and has no default, or if it is not a number
+        with a magnitude of at most 1e30.
+        """
         if default is not None and name not in self.attributes:
             return default
         return self.vector(name, 1)[0]
