@@ -1,9 +1,10 @@
-"""Control allocation: convert the commands of one set of inputs to another set with limits.
+"""Control allocation: convert commands for some inputs to commands for other inputs with limits.
 
-The allocated inputs minimise the error of the accelerations within the limits. An active set method
-solves this bounded least squares problem. It starts with all inputs at zero. If the bounds of an
-input exclude zero, this input starts at the bound nearest to zero. The problem is strictly convex,
-so the solution does not depend on the order in which inputs reach their bounds.
+The allocated inputs stay within their limits. They minimise the difference between their
+accelerations and the accelerations of the command. An active set method solves this bounded least
+squares problem. The method starts with all inputs at zero. If the bounds of an input exclude zero,
+this input starts at the bound nearest to zero. The problem is strictly convex, so the solution does
+not depend on the order in which inputs reach their bounds.
 
 References
 ----------
@@ -21,8 +22,9 @@ from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import called, load, root, store
 
-# The cost contains the squares of the inputs, multiplied by LEAST^2. Among inputs with the same
-# effect, this term selects the smallest inputs.
+# `solve` minimises the squared error of the scaled force plus LEAST^2 times the sum of the squared
+# scaled inputs x. If several x produce the same force, the second term selects the x with the
+# smallest norm.
 LEAST = 1e-7
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -38,16 +40,18 @@ class LeastSquares(
 
     The other fields are work space:
 
-    - `A`: the vectors of `columns` for one lane. The first k are divided by the norm of the matrix
-      that they form.
+    - `A`: the vectors of `columns` for one lane. The first k are divided by the Frobenius norm of
+      the matrix that they form.
     - `Q`, `R`: QR factors of a matrix with one column (size + k,) for each free input. A column
       contains the force of its input from `A`, and then one entry for each of the k inputs. This
       entry is `LEAST` for the input of the column, and 0 for the other inputs.
     - `order`: the free inputs, in the order in which they became free.
-    - `b`: the residual. `y`: the components of the residual along the vectors of `Q`.
-    - `wanted`: the given force, scaled to length 1.
+    - `b`: first the right-hand side of the least squares problem, then its residual. `y`: the
+      components of the right-hand side along the vectors of `Q`; later work space of `_steepest`.
+    - `wanted`: the given force, scaled to length 1; later the force that x produces.
     - `s`: the least squares solution without bounds. `low`, `high`: the bounds of the scaled x.
     - `state`: for each input, whether it is free, at its lower bound or at its upper bound.
+      `_TRIED` is added if the input could not leave its bound.
     """
 
 
@@ -96,13 +100,14 @@ def _row_products(a: Array, size: int, b: Array, out: Array) -> None:
 
 @vec.compiled_as(_row_products)
 def row_products(a: Array, size: int, b: Array, out: Array) -> None:
-    """Write the scalar product of b[:size] with each row (size,) of a to `out`."""
+    """Write to `out` the scalar products of b[:size] with the rows (size,) of a."""
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
 def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
     # This is the modified Gram-Schmidt method. The least squares solution is as accurate as with
-    # Householder's method, because the right-hand side is treated as the last column of the matrix.
+    # Householder's method, because `_fit` treats the right-hand side as the last column of the
+    # matrix.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)
@@ -111,9 +116,10 @@ def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, 
 
 @vec.compiled_as(_remove_components)
 def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
-    """Make x (size,) orthogonal to the first `count` rows of Q, which have unit length.
+    """Make x (size,) orthogonal to the first `count` rows of Q.
 
-    The components of x along these rows are written to `found`, from the index `first` on.
+    These rows must be orthonormal. The components of x along them are written to `found`, from the
+    index `first` on.
     """
     basis = Q[: count * size].reshape(count, size)
     components = basis.dot(x)
@@ -137,7 +143,10 @@ def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None
 
 
 def least_squares(least, most, size):
-    """Return a `LeastSquares` problem with the bounds (k,) for forces (size,), for one lane."""
+    """Return a `LeastSquares` problem with the bounds `least` and `most` (k,), for forces (size,).
+
+    All other arrays contain zeros, and have one axis.
+    """
     count = len(least)
     lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
     lengths |= dict.fromkeys(("columns", "A"), (count + 1) * size)
@@ -193,7 +202,8 @@ def allocate(allocation, point, commanded):
 def _write_force(work, robot, point, columns, at):
     """Write the generalised force of the inputs `point.pushing` to `columns`, from index `at` on.
 
-    The inputs are converted to base axes in place.
+    First, the torques and forces of `point.pushing` that are in reference axes are rotated to base
+    axes, in place.
     """
     turn_held(robot, point)
     push(work, robot.tree, point.pushing)
@@ -294,8 +304,8 @@ def _fit(problem, size, free, kept):
     s, x, Q, R, b, y = problem.s, problem.x, problem.Q, problem.R, problem.b, problem.y
     order, A, count = problem.order, problem.A, len(problem.s)
     rows = size + count
-    # Write the residual for free inputs at zero: `wanted` minus the force of all inputs that are at
-    # their bounds.
+    # Write the right-hand side to b: `wanted` minus the force of all inputs that are at their
+    # bounds, and then -LEAST times each of these inputs.
     b[:] = 0.0
     write_scaled(problem.wanted, 0, 1.0, b[:size])
     for j in range(count):
@@ -346,7 +356,8 @@ def nearest(A, b, least, most):
     If several u are equally good, the u with the smallest norm is returned.
     """
     numbers, size = [0.0] * len(least), len(b)
-    # Reading an entry is faster for lists than for arrays, so lists replace the work arrays.
+    # Reading an entry is faster for lists than for arrays, so lists replace the arrays that are
+    # read entry by entry.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(
         columns=np.concatenate((A.T.ravel(), b)),
         state=[0] * len(least),

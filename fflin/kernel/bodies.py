@@ -1,11 +1,12 @@
-"""Inertia M by composite rigid bodies, and accelerations and forces of the bodies by RNEA.
+"""Inertia M (composite rigid body algorithm), and accelerations and forces of the bodies (RNEA).
 
 All vectors are in base axes, so no vector is rotated from joint to joint. Moments and inertias of a
 body are about its joint. If they were about the base's origin, the inertia of a light tool on a
-long arm would lose digits. Row i of the packed M holds the nonzero entries of this row up to the
-diagonal. Their column indices are the coordinates on the path from the base to coordinate i. If
-coordinate j is on this path, the path to j is the beginning of the path to i. So the column indices
-of row j are also the first column indices of row i.
+long arm would lose digits. Row i of the packed M holds the entries up to the diagonal that can be
+nonzero in M or its factor. Their column indices are the coordinates on the path from the base to
+coordinate i; see `kernel.tree._paths`. If coordinate j is on this path, the path to j is the
+beginning of the path to i. So the column indices of row j are also the first column indices of
+row i.
 
 References
 ----------
@@ -20,9 +21,10 @@ from fflin.kernel.vectors import load, store
 # acceleration that c adds to it, and Psi''. Here c is the acceleration of the coordinates (3.1).
 # Psi' and Psi'' are defined in `kernel.derivatives`.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
-# Offsets of the loads of the subtree beyond each joint. The momentum p, the columns of G and the
-# stored momentum h are defined in `kernel.derivatives`. FORCE is the moment and force that the
-# motion of the subtree requires for c = 0. CARRIED is the moment and force that c requires;
+# Offsets of the loads of the subtree beyond each joint. MOMENTUM is the momentum p, MOMENTS are the
+# columns of G, and STORED is the stored momentum h; see `kernel.derivatives`. FORCE is the moment
+# and force that the motion of the subtree requires for c = 0, minus the wrenches of `load_carried`.
+# Before `collect`, FORCE is for the single body. CARRIED is the moment and force that c requires;
 # `accelerate_bodies` adds CARRIED to FORCE.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 
@@ -198,7 +200,10 @@ def invert_factor(work, tree):
 
 
 def multiply(work, tree, judged):
-    """Write M^-1 = U D^-1 U^T at `square`, and the sum of all M_ii (M^-1)_ii at `judged`."""
+    """Write M^-1 = U V^T at `square`, and the sum of all M_ii (M^-1)_ii at `judged`.
+
+    `invert_factor` must have written U = L^-1 and V = L^-1 D^-1.
+    """
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size, coupling = len(tree.row), 0.0
     for i in range(size):
@@ -287,7 +292,7 @@ def load_bodies(work, tree):
 
 
 def load_carried(work, tree, u):
-    """Subtract the wrenches of body-fixed inputs u from the forces of the bodies."""
+    """Subtract the wrenches of the body-fixed inputs in u from the forces of the bodies."""
     for index in range(len(tree.wrench_body)):
         push = vec.times6(carried_wrench(work, tree, index), -load(u, tree.input[index]))
         vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
@@ -379,9 +384,10 @@ def collect(work, tree):
 
 
 def accelerate_bodies(work, tree):
-    """Write Psi'' and the accelerations that c adds, and add the forces that c requires.
+    """Write Psi'' and the accelerations that c adds, and add the forces that c requires to FORCE.
 
-    The accelerations are computed from the base to the tips, the forces from the tips to the base.
+    c begins at work[tree.c]. `collect_momenta` must have set CARRIED to zero. The accelerations are
+    computed from the base to the tips, the forces from the tips to the base.
     """
     vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
     for body in range(1, len(tree.parent)):

@@ -15,8 +15,8 @@ Here I_i, B_i and f_i are the inertia, the Coriolis matrix and the spatial force
 beyond joint i. Let p be the linear momentum of the subtree. The stored momentum h is the sum of the
 momenta of those wheels in the subtree that have no inertia in the model. The matrix G is the sum of
 m v r^T over the mass points of the subtree. Each mass point has the mass m, the velocity v and the
-position r from the joint. For a rotation with the angular velocity w, the force part of 2 B w is
-2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
+position r from the joint. Let s be a motion vector with the angular part w. The force part of 2 B s
+is 2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
 
 References
 ----------
@@ -41,7 +41,10 @@ from fflin.kernel.vectors import load, store
 
 
 def _coriolis(work, at, w):
-    """Return 2 B w (moment, force), with the Coriolis matrix B of a joint's subtree."""
+    """Return 2 B s (moment, force) for a motion vector s with the angular part w.
+
+    B is the Coriolis matrix of a joint's subtree. 2 B s does not depend on the linear part of s.
+    """
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
@@ -64,10 +67,11 @@ def _coriolis_transposed(work, at, along):
 
 
 def differentiate(work, tree):
-    """Write the derivatives of M c + b - B_u u - f at constant c, with spring and damper forces f.
+    """Write the derivatives of M c + b - B_u u - f at constant c.
 
-    The derivatives are a matrix (6 + n, 12 + 2 n). Each column is the derivative with respect to
-    one coordinate of a displacement of the state, in base axes.
+    b is the bias, and f are the spring and damper forces. The derivatives are a matrix
+    (6 + n, 12 + 2 n). Each column is the derivative with respect to one coordinate of a
+    displacement of the state, in base axes.
     """
     n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
     spin = vec.get3(work, tree.motion)
@@ -76,8 +80,10 @@ def differentiate(work, tree):
         row = tree.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
-    # For each joint, write the derivatives of all forces with respect to the joint's position and
-    # rate. Also write the derivatives of the joint's force with respect to omega_b.
+    # The path of a joint i is the base, the joints before joint i, and joint i itself. For each
+    # joint i, write the derivatives of the forces of its path with respect to the position and rate
+    # of joint i. Also write the derivatives of the force of joint i with respect to the positions
+    # and rates of the joints before it, and with respect to omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         moving = tree.motion + body * MOTION
@@ -168,17 +174,17 @@ def _solve(work, tree, slopes):
 
 
 def _pack(rows, first, lanes):
-    """Copy eight rows to the eight columns of `lanes` (entries, 8), beginning at row `first`."""
+    """Copy rows[first : first + 8] to the eight columns of `lanes` (entries, 8)."""
     for entry in range(len(lanes)):
         for lane in range(LANES):
             lanes[entry, lane] = rows[first + lane, entry]
 
 
 def _unpack(work, start, entries, out, first, offset):
-    """Copy rows of `work` (.., 8) to columns of `out`, and the eight columns to eight rows.
+    """Copy `entries` rows of `work` (.., 8), transposed, to eight rows of `out`.
 
-    Row `start` and column 0 of `work` are copied to column `offset` and row `first` of `out`. The
-    number of copied rows of `work` is `entries`.
+    The first copied row is row `start` of `work`. It is copied to column `offset` of `out`, from
+    row `first` on.
     """
     for entry in range(entries):
         for lane in range(LANES):
@@ -186,9 +192,17 @@ def _unpack(work, start, entries, out, first, offset):
 
 
 def derive(tree, points, out, lanes, work):
-    """Compute the results of `RowAccelerations` at eight or more points, and write them to `out`.
+    """Write the accelerations c, their derivatives and the sums of the couplings at N points.
 
-    For points at rest, `nu` is empty, and only D_u and the sums of the couplings are written.
+    N must be at least 8. All arrays in `points` and `out` have one row per point.
+
+    - `points`: q, nu, force and u. `force` contains the generalised forces of springs, dampers and
+      all inputs that are not body-fixed. For points at rest, nu, force and u are empty.
+    - `out`: c, A, by_u and judged. A row of A is a flattened matrix (nx, nx). The lower half of
+      this matrix receives the derivatives of c with respect to displacements of the state. For
+      points at rest, c and A are not written. `by_u` receives D_u (3.3), flattened. `judged` (N, 1)
+      receives the sum of the couplings M_ii (M^-1)_ii.
+    - `lanes`, which is a `Packed`, and `work` are work space.
     """
     q, nu, force, u = points
     c, A, by_u, judged = out
@@ -198,7 +212,7 @@ def derive(tree, points, out, lanes, work):
     coupling = inputs + size * len(tree.driven)
     for block in range(0, len(q), LANES):
         # If fewer than eight points are left, the last block begins at an earlier point, so that
-        # the block has eight points. Some points of the previous block are computed twice.
+        # the block has eight points. Some points of the previous block are then computed twice.
         first = min(block, len(q) - LANES)
         _pack(q, first, lanes.q)
         bodies.outwards(work, tree, lanes.q)
@@ -233,7 +247,7 @@ def derive(tree, points, out, lanes, work):
             _unpack(work, slopes, lower, A, first, A.shape[1] - lower)
 
 
-_FARTHEST = 1e6  # [rad] `vectors.cosine_and_sine` is accurate for angles below this value
+_FARTHEST = 1e6  # [rad] `vectors.cosine_and_sine` is accurate for angles of smaller magnitude
 
 
 class Packed(namedtuple("Packed", "q nu force u")):
@@ -243,10 +257,10 @@ class Packed(namedtuple("Packed", "q nu force u")):
 class RowAccelerations:
     """Accelerations c and their derivatives at N points, computed by the compiled kernel.
 
-    Both `write` and `write_inverse` return a mask (N,) that is true at points with accurate
-    results. At these points, M is well-conditioned, and all joint angles are below 1e6 rad in
-    magnitude. The sum of the couplings M_ii (M^-1)_ii shows whether M is well-conditioned; see
-    `dynamics.rnea`.
+    N must be at least 8. Both `write` and `write_inverse` return a mask (N,) that is true at points
+    with accurate results. At these points, M is well-conditioned, and the joint entries of q are
+    below 1e6 in magnitude. The sum of the couplings M_ii (M^-1)_ii shows whether M is
+    well-conditioned; see `dynamics.rnea`.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:

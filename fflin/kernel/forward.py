@@ -29,7 +29,8 @@ class Mechanics(
 ):
     """Parameters of a robot in the simulation loop.
 
-    Each array of doubles may have a second axis of eight lanes.
+    In compiled code, the arrays of `faults` and some arrays of `tree` have a second axis of eight
+    lanes. The other arrays have no axis of lanes.
 
     - `tree`: the kinematic tree.
     - `gravity` (3,): gravity in world axes [m/s^2].
@@ -40,7 +41,7 @@ class Mechanics(
     - `springy`: for each joint, whether the joint has a spring or a damper.
     - `rest`: for each joint, the position at which the spring exerts no force.
     - `triads`: one index for each vector input, which is a torque or force on the base with three
-      components. The index is that of the first component among all inputs.
+      components. The index is the position of the first component among all inputs.
     - `held`: the entries of `triads` for the vector inputs in reference axes.
     - `origin` (7,): placement of the world relative to the reference, as position and quaternion.
     - `faults`: the `ActuatorFaults`.
@@ -104,7 +105,10 @@ def apply_faults(faults, triads, t, u, given):
 
 
 def turn_held(robot, point):
-    """Rotate the torques and forces of `point.pushing` from reference to base axes, in place."""
+    """Rotate the torques and forces that are in reference axes to base axes, in place.
+
+    They are entries of `point.pushing`, and begin at the indices in `robot.held`.
+    """
     pushing = point.pushing
     for index in range(len(robot.held)):
         at, turn = robot.held[index], vec.attitude(robot.origin)
@@ -170,8 +174,8 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 
     All vectors are in world axes. The arrays may have a second axis of lanes.
 
-    - `start` (12,): the initial momentum (6,), the initial centre of mass (3,), and the point (3,)
-      relative to which angular momentum and centre of mass are measured.
+    - `start` (12,): the initial linear and angular momentum (6,), the initial centre of mass (3,),
+      and the point (3,) relative to which angular momentum and centre of mass are measured.
     - `weight` (3,): mass times gravity.
     - `per_mass` (1,): 1 / mass.
     - `sums` (18,): four vectors. The first two are for the time before the current step: the
@@ -231,7 +235,8 @@ def kept_at(reference, t):
 def start_at(work, robot, reference, point):
     """Write the robot's initial momentum and centre of mass into `reference.start`.
 
-    `point` is the initial point. `configure` must be called before this function.
+    `point` is the initial point. `configure` must be called before this function. The last three
+    entries of `reference.start`, the point of reference, must already be set.
     """
     axes, tree = vec.axes_of(point.q), robot.tree
     lever = vec.get3(work, tree.inertias + 1)
@@ -266,9 +271,9 @@ def _momentum_error(work, robot, nu, momentum):
 def impose(work, robot, reference, point, t):
     """Set the base's position and velocity so that momentum and centre of mass match the reference.
 
-    `configure` must be called before this function. The equations are solved for the correction of
-    the velocity, not for the velocity itself. The correction is small and has small rounding
-    errors.
+    t [s] is the end of the last finished step. `configure` must be called before this function. The
+    equations are solved for the correction of the velocity, not for the velocity itself, because
+    the correction is small and has small rounding errors.
     """
     tree, nu = robot.tree, point.nu
     axes = vec.axes_of(point.q)
@@ -280,8 +285,8 @@ def impose(work, robot, reference, point, t):
     angular = vec.across(axes, vec.minus(angular, vec.cross(position, linear)))
     linear = vec.across(axes, linear)
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
-    # Compute the correction of omega_b with the robot's inertia about the robot's centre of mass.
-    # Compute the correction of v_b from the correction of omega_b.
+    # Compute the correction w of omega_b with the robot's inertia about the robot's centre of mass.
+    # Compute the correction of v_b from w and the error of the linear momentum.
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))

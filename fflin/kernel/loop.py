@@ -29,7 +29,7 @@ class Wheels(
     - `at`: index of the wheel's input. `row`: index of the wheel's speed in nu.
     - `least_torque`, `most_torque` [N m]: torque limits of the motor.
     - `least_speed`, `most_speed` [rad/s]: speed limits.
-    - `stiffness`: J / dt.
+    - `stiffness`: J / dt, with J at the initial configuration.
     """
 
 
@@ -81,7 +81,10 @@ def limit(channel, u):
 
 
 def is_asked(channel, step):
-    """Return whether the policy is evaluated at the start of a step."""
+    """Return whether the policy is evaluated in a step.
+
+    Continuous commands are evaluated in every step, sampled commands at the start of each sample.
+    """
     return channel.sample == 0 or step % channel.sample == 0
 
 
@@ -97,7 +100,8 @@ def transmit(channel, step, nu, u):
         if channel.sample > 0:
             first = (step // channel.sample) % channel.slots * count
             vec.copy(u, 0, channel.pending, first, count)
-    # Write the latest command that has arrived. For a pulsed thruster, write the present thrust.
+    # If commands are sampled, write the latest command that has arrived to u. For a pulsed
+    # thruster, write the present thrust instead.
     if channel.sample > 0:
         any_fresh = False
         for lane in range(vec.lane_count(channel.delay)):
@@ -238,7 +242,8 @@ def _combine(shares, row, rates, out):
 def goes_on(stop, origin, q, rates):
     """Return True if all velocities are below their limits and the base is within the chart.
 
-    `rates` are the velocities. In compiled code, both conditions must be met in all lanes.
+    `rates` are the velocities. If `stop.sign` is 0, every attitude is allowed. In compiled code,
+    both conditions must be met in all lanes.
     """
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))
@@ -339,8 +344,8 @@ class RunStatistics(
     - `kind` (nx,): the states are grouped into kinds; the joint positions, for example, are one
       kind. Each entry is the index of the kind of one state. The index 0 is for the attitude, and
       for states that count only in `largest_x`. The index -1 is for states that do not count.
-    - `settled`, `tolerance` (kinds,): the bound for settling is `settled` times the largest error
-      of the kind, or `tolerance` if `tolerance` is larger.
+    - `settled`, a number, and `tolerance` (kinds,): the bound for settling is `settled` times the
+      largest error of the kind, or the kind's `tolerance` if `tolerance` is larger.
     - `steps` (times,): the steps at which values are recorded: the errors of the kinds in `errors`,
       the inputs in `inputs`, and the errors of the states in `states`.
     - `at`: work space for the point. All fields after `at` have one column per lane.

@@ -8,10 +8,10 @@ representation). For a function that Python calls, numba generates machine code 
 of the function and of all needed parts.
 
 The operations of `kernel.vectors` are compiled for one number or for eight numbers. An array with
-one axis holds numbers. An array with a second axis of length eight holds lanes: each lane is one
-robot, and one instruction computes all eight. If an operation combines lanes with a double, the
-double stands for eight equal numbers. So a function that is written for one number can be compiled
-for eight.
+one axis holds numbers. An array with a second axis of length eight holds lanes: each lane belongs
+to one point or run, and one instruction computes all eight. If an operation combines lanes with a
+double, the double stands for eight equal numbers. So a function that is written for one number can
+be compiled for eight.
 
 LLVM does not vectorise loops over arrays that may overlap. So the eight numbers of an entry are one
 value of the vector type `Lanes`, whose operations LLVM compiles to vector instructions. If a
@@ -109,15 +109,16 @@ _arithmetic(operator.neg, ir.IRBuilder.fneg, 1)
 def _operation(
     replaced: Callable[..., object], typed: Typer
 ) -> Callable[[Generator], Callable[..., object]]:
-    """Return a decorator for the code generator that replaces a function of `vectors`.
+    """Return a decorator for code generators.
 
-    If the first argument of the replaced function is an array, the generator receives the address
-    of the array's first entry. The entry is a double or a vector of eight doubles.
+    In compiled code, the code of the decorated generator replaces the function `replaced` of
+    `vectors`. If the first argument of this function is an array, the generator receives the
+    address of the array's first entry. The entry is a double or a vector of eight doubles.
     """
 
     def decorated(generate: Generator) -> Callable[..., object]:
         @extending.intrinsic
-        @wraps(generate)  # numba reads the number of arguments
+        @wraps(generate)  # numba reads the number of arguments from the signature of `generate`
         def operation(_: TypingContext, *kinds: Type) -> tuple[Signature, Generator]:
             def generated(
                 context: BaseContext,

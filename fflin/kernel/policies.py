@@ -14,7 +14,7 @@ from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
 from fflin.kernel.vectors import angle, called, chosen, load, store, whole
 
-_NEAR = 1e-9  # a time counts as a knot if it is nearer than this fraction of the interval
+_NEAR = 1e-9  # a time nearer to a knot than this fraction of the interval counts as the knot
 
 
 class Path(
@@ -73,11 +73,11 @@ def _placed(knots, time):
 
 
 def error(robot, path, point):
-    """Write the error (5.1) of a point of the robot relative to the followed point to `path.e`.
+    """Write to `path.e` the error (5.1) of `point` relative to the followed point `path.point`.
 
-    The followed point is `path.point`. The position error is in the axes of the base at the
-    followed point. The velocity error is the robot's nu minus nu of the followed point. Each nu is
-    in base axes: of the robot's base, or of the base at the followed point.
+    The position error is in the axes of the base at the followed point. The velocity error is
+    `point.nu` minus `path.point.nu`. The first is in the axes of the base at `point`, the second in
+    the axes of the base at the followed point.
     """
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
@@ -165,13 +165,13 @@ class Law(
       sample is one row of `added` (slots, ny). After the last row, the first row is used again.
     - `turned` (2,): one entry for omega_b and one for v_b. True: the state contains the velocity in
       reference axes. False: the state contains the velocity in base axes.
-    - `origin` (rows, 7): pose of the world frame relative to the reference, which is the pose of
-      the base at which q_b and r_b are 0.
+    - `origin` (rows, 7): pose of the world frame relative to the reference. The reference is the
+      pose of the base at which q_b and r_b are 0.
     - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint
       differs from the position of the joint in `near` by at most pi.
     - `origin` and `near` have one row per sample. The last row also applies to all later samples.
-    - `u`: the command. If `allocation` has inputs, the command is distributed to the inputs of
-      `allocation`.
+    - `u`: the command. If `allocation.problem` has inputs, `allocate` distributes the command to
+      the inputs of `allocation.giving`.
     """
 
 
@@ -187,7 +187,7 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
     """Linear controller u = u0 + C z + D dy with dy = y - y0.
 
     z (nz,) is the controller state. Before each evaluation, `jump` is added to z. All arrays except
-    `z` and `rates` have one row per sample, like `Law.origin`.
+    `z` and `rates` have one vector or matrix per sample, like `Law.origin`.
 
     - In discrete time, A z + B dy is the next z, and `rates` (nz,) is work space.
     - In continuous time, A z + B dy is dz/dt. `rates` (1 + s, nz) stores z at the beginning of the
@@ -239,8 +239,8 @@ def _times(matrix, row, x):
 def command(work, robot, law, point, t, count, stage):
     """Write the command of a policy into `law.u`.
 
-    t [s] is the time of the run, `count` the index of the sample, and `stage` the index of the
-    stage in the step.
+    t [s] is the time of the run, and `stage` the index of the stage in the step. `count` is the
+    index of the sample, or the index of the step if commands are continuous.
     """
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
@@ -308,7 +308,7 @@ def _corner(grid, corner, lane):
 def _filter(by, y, u, row, stage):
     """Write the command u of a linear controller, and the controller's next z or dz/dt.
 
-    `by` is the linear controller, a `Filter`.
+    `by` is the linear controller, a `Filter`. The outputs y are replaced by dy = y - y0.
     """
     size, outputs, inputs = len(by.z), len(y), len(u)
     along = len(by.rates) > size

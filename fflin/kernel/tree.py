@@ -25,7 +25,7 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-LANES = 8  # number of points that the kernel evaluates with each instruction
+LANES = 8  # number of points or runs that compiled code computes at a time
 
 
 def address_of(array: NDArray[np.generic]) -> int:
@@ -199,7 +199,8 @@ class Tree(
 
     - `driven`: the coordinate that each input drives, -1 for a body-fixed wrench.
     - `wrench_body`: the body of each body-fixed input. `wrench`: the wrench per unit of the input,
-      at the body's joint. `input`: the index of the body-fixed input among all inputs.
+      about the body's joint and in joint axes. `input`: the index of the body-fixed input among all
+      inputs.
     - `stored_body`: the bodies with a stored momentum. `stored`: the stored momenta in joint axes.
     - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
@@ -221,8 +222,8 @@ TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON
 def batch_tree(robot: Robot) -> Tree | None:
     """Return the tree of a robot.
 
-    Return None in orbit, or if a joint is not a screw joint. A screw joint is revolute, prismatic
-    or helical, with a constant axis.
+    Return None if the robot is in orbit, or if a joint is not a screw joint. A screw joint is
+    revolute, prismatic or helical, with a constant axis.
     """
     if robot.orbit:
         return None
@@ -323,7 +324,8 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
     turn = float(np.linalg.norm(angular))
     axis = angular / turn if turn else linear / np.linalg.norm(linear)
     slide = float(linear @ axis)
-    # In Pinocchio, the axis of every screw joint passes through the origin of the joint's frame.
+    # The axis must pass through the origin of the joint's frame, as for all screw joints of
+    # Pinocchio.
     if np.abs(linear - slide * axis).max() > 1e-12:
         return None
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
@@ -331,10 +333,15 @@ def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, flo
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return the columns of the nonzero entries in each row of L (M = L^T D L), diagonal last."""
-    # With mimic joints, one coordinate moves several bodies. The ancestors of these bodies may be
-    # on different branches. The factorisation of M makes further entries nonzero. So the
-    # coordinates of all ancestors must be on one path, as in Liu's elimination tree.
+    """Return, for each coordinate, its path from the base in the elimination tree of M = L^T D L.
+
+    Row i of L and row i of L^-1 can be nonzero only in the columns of path i. Path i ends with i.
+    """
+    # Without mimic joints, path i contains the coordinates of the base and of the joints from the
+    # base to joint i. With mimic joints, one coordinate moves several bodies. The ancestors of
+    # these bodies may be on different branches. The factorisation of M then makes further entries
+    # nonzero. So the coordinates of all ancestors must be on one path, as in Liu's elimination
+    # tree.
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

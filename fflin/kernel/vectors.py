@@ -21,7 +21,9 @@ import numpy as np
 
 from fflin.base.validation import Array
 
-_TERMS = 10  # exact to machine precision for angles up to pi; a step rotates by less than 1 rad
+# Number of terms of a series. For rotations of the base by at most 1.9 rad, the series are exact to
+# machine precision. In one step, the base rotates by less than 1 rad about each of its axes.
+_TERMS = 10
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -39,7 +41,7 @@ IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
 def called(function: F) -> F:
-    """Mark a rarely called function that numba must not inline, which saves compile time."""
+    """Mark a rarely called function that numba must not inline, to save compile time."""
     CALLED.add(function)
     return function
 
@@ -300,7 +302,7 @@ def displace(tree, q, along, out):
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square
-    sine, cosine = _sine(quarter), _cosine(quarter)  # sin(a/2) / (a/2), cos(a/2)
+    sine, cosine = _sine(quarter), _cosine(quarter)  # sin(a/2) / (a/2) and cos(a/2), with a = |w|
     shift = plus(times(v, sine * cosine), times(cross(w, v), 0.5 * sine * sine))
     shift = plus(shift, times(w, dot(w, v) * _sixth(square) * (1.0 / 6.0)))
     quaternion = attitude(q)

@@ -161,7 +161,7 @@ class ModelDerivatives:
         return found
 
     def difference(self, one: Parameter) -> float:
-        """Return the relative error of dA and dB, compared with finite differences of order 4."""
+        """Return the larger relative error of dA and dB, from finite differences of order 4."""
         if not one.bodies:
             raise InputError(
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
@@ -254,7 +254,7 @@ class ModelDerivatives:
         """Return the generalised forces that RNEA computes, and their derivatives.
 
         The derivatives are with respect to q_m, nu and base rotations. The forces of springs and
-        inputs are not included.
+        inputs are not included. In orbit, the gravity gradient is subtracted.
         """
         state, data, q, gradient = self._state, self._data, self._q, self._gradient
         by_turn: Array = np.zeros((len(self._v), 3))

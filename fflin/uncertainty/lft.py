@@ -21,7 +21,7 @@ signals:
 
 These numbers are minimal. No :math:`r_k` can be smaller than the rank of the derivative of the
 inertia matrix M with respect to the parameter. Because X has full rank on a free base, each number
-is equal to this rank.
+is equal to this rank if D is nonsingular.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def linear_fractional(
     # M contains products of the parameters of a link, such as mass and centre of mass. The damping
     # force of a mode contains the product of its frequency and damping ratio. Therefore all
     # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
-    # index of the parameter}}.
+    # index of the parameter}}. For a link, `joint` is -1.
     together: dict[tuple[str, int], dict[str, int]] = {}
     sprung = {name for name, stiffness in ready.robot.stiffness.items() if stiffness}
     modes = sprung & {joint.name for joint in ready.robot.modes}

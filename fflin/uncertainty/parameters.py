@@ -24,7 +24,7 @@ ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", 
 OF_PIECES = {"mass", "density", *(f"com.{axis}" for axis in AXES)}
 OF_PIECES |= {f"inertia.{entry}" for entry in ENTRIES}
 _ROUNDING = 1e-9
-_TURN = 2.0 * math.pi  # [rad]
+_TURN = 2.0 * math.pi  # [rad] one revolution
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,9 @@ class Parameter:
     joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
-    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). To first order, this
-    # is the change, per unit of the parameter, of the wrench that a unit input exerts.
+    # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). A unit of the input
+    # exerts a wrench. The third entry is the first derivative of that wrench with respect to the
+    # parameter.
     wrench: tuple[int, int, Array] | None = None
 
     @property
@@ -65,7 +66,7 @@ class Parameters(dict[str, Parameter]):
     def find(self, key: str) -> list[str]:
         """Return the names of the parameters that match a name or pattern.
 
-        Parameters of a body of several links are returned only if the pattern matches no link.
+        For a pattern, parameters of a body of several links are returned only if no link matches.
         """
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
@@ -91,7 +92,8 @@ class Parameters(dict[str, Parameter]):
         """Return why the robot with {parameter: value} is not realisable, or an empty text."""
         try:
             self._bodies(values)
-            if self._robot.wheels or self._robot.modes:  # a link may be too light for these
+            # Also create the robot, because a link may be too light for its wheels or modes.
+            if self._robot.wheels or self._robot.modes:
                 self.robot(values)
         except InputError as error:
             return str(error)

@@ -37,8 +37,9 @@ class Derivatives(FrozenArrays):
         Derivatives, with the shapes of A, B, C and D.
     df0, dy0 : ndarray (nx,), (ny,)
         Derivatives of the state's rate and of the outputs at the point, for constant state and
-        inputs. For a model with `moving`, df0 is the rate at which a robot with the changed
-        parameter departs from the reference.
+        inputs. For a sampled model, the change of the state in one sample replaces the rate. For a
+        model with `moving`, df0 is the rate at which a robot with the changed parameter departs
+        from the reference.
     """
 
     name: str

@@ -24,15 +24,16 @@ _CORNERS = 256
 # Largest number of steps of a local search, and trial lengths of a step relative to half a range.
 # Steps are cut off at the ends of the ranges, so the length 1e9 leads to a corner of the set.
 _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
-# In each step, the exact criterion is computed for _HELD trial points. The quick criterion uses
-# _FREQUENCIES frequencies. Gradients are finite differences with the step _DIFFERENCE.
+# In each step, the exact criterion is computed for the _HELD trial points with the largest quick
+# criterion. The quick criterion of a gain uses at most _FREQUENCIES frequencies. Gradients are
+# finite differences with the step _DIFFERENCE.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# slycot is used only for models with at most this number of signals. Its run time grows with the
-# fifth power of the number of signals.
+# slycot is used only for models with at most this number of signals in z. Its run time grows with
+# the fifth power of the number of signals.
 _SIGNALS = 24
 # The search over frequency begins with a grid of _LOOK frequencies. The bound of an interval is
 # computed at _INSIDE frequencies. A step of the search divides one interval, or calls slycot for
@@ -222,9 +223,9 @@ class Loops:
 def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
     """Return the largest criterion that local searches find, and the deltas where it occurs.
 
-    The first search starts at the first sample. A new search starts at each later sample whose
-    criterion exceeds the largest one found so far. So the result is at least the criterion of every
-    sample, and cannot decrease if more samples are appended.
+    The first search starts at the first row of `tried`. A new search starts at each later row whose
+    criterion exceeds the largest criterion found so far. So the result is at least the criterion of
+    every row, to the accuracy of `Figures.above`. It cannot decrease if rows are appended.
     """
     best, at = _climbed(figures, tried[0], refuse)
     ahead = tried[1:]
@@ -236,7 +237,10 @@ def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> 
 
 
 def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
-    """Maximise a criterion locally; a step follows the gradient, or sets one delta to -1 or 1."""
+    """Maximise a criterion locally from `start`; return the maximum and its deltas.
+
+    A step follows the gradient, or sets one delta to -1 or 1.
+    """
     quick, exact, _ = figures
     value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
     for _ in range(_STEPS):
@@ -311,7 +315,7 @@ def largest_bound(
     """Return the largest bound of mu for response(w) over all frequencies w.
 
     `end` is the response at infinity. `rates` are the magnitudes and imaginary parts of the loop's
-    poles.
+    poles, without zeros. `blocks` contains the number of repetitions of each delta.
     """
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
     grid = np.unique(np.concatenate(((0.0,), grid, rates)))
@@ -319,7 +323,11 @@ def largest_bound(
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
-        """Return the bound over [a, b], the scaling that gives it, and the bound at (a + b)/2."""
+        """Return the bound over [a, b], the scaling that gives it, and the bound at (a + b)/2.
+
+        Both are the least bounds over the scalings in `known` and from `_scalings`. slycot is used
+        only if `asked` is true.
+        """
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
         found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
@@ -348,7 +356,11 @@ def largest_bound(
 
 
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
-    """Return trial scalings for Z; if blocks are given, include the scaling by slycot's AB13MD."""
+    """Return trial scalings (d, g) for Z.
+
+    The first scaling is from `perron`. If `blocks` is not empty and slycot is installed, the second
+    is from slycot's AB13MD. For a Z with one complex entry, a formula replaces AB13MD.
+    """
     none: Array = np.zeros(len(Z))
     found: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
