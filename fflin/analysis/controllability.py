@@ -27,9 +27,9 @@ _LOOPS = (
     "joint amplitude e, although the linear model does not show it"
 )
 
-# A singular value of the scaled Popov-Belevitch-Hautus matrix counts as zero if it is below this
-# fraction of the largest singular value. Repeated eigenvalues have relative rounding errors of
-# about this size.
+# A singular value of the scaled Popov-Belevitch-Hautus matrix [A - p I, B] counts as zero if it is
+# below this fraction of the largest singular value. The fraction is this large because a repeated
+# eigenvalue p has a relative rounding error of about this size.
 _RANK = 1e-7
 
 
@@ -225,15 +225,15 @@ def controllability(lin: LinearModel) -> Controllability:
 def _by_second_order(
     lin: LinearModel, conserved: ConservedMomenta
 ) -> tuple[Array, Array, list[str] | None, str, ranks.FixedPoles] | None:
-    """Find the controllable subspace of a model at rest whose conserved momenta are removed.
+    """Find the controllable subspace of a model at rest, without its conserved momenta.
 
     The subspace is expressed in 2 r states: the r coordinates `conserved.kept` and their rates.
-    Return None if the model is not at rest or the test is inconclusive. Otherwise return five
-    results:
+    Return None if `mechanics.at_rest` finds no second-order system, or if the test is inconclusive.
+    Otherwise return five results:
 
     - a basis (2 r, d) of the controllable subspace;
-    - a matrix (2 r - d, 2 r), whose rows are combinations of states on which no input acts;
-    - the names of these rows, or None if the caller must form the names from the state names;
+    - a matrix (2 r - d, 2 r), each row of which is an uncontrollable combination of these states;
+    - the names of the rows, or None if the caller must form the names from the state names;
     - the name of the method;
     - the fixed poles.
     """
@@ -243,17 +243,19 @@ def _by_second_order(
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
     idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # S has rank r: the inputs can accelerate the r coordinates independently, so all 2 r states
-        # are controllable.
+        # S has rank r, so the inputs can accelerate the r coordinates independently, and all 2 r
+        # states are controllable. Sampled models with springs or dampers are excluded, because
+        # sampling may make their states uncontrollable.
         everything = np.eye(2 * r)
         return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
     S = system.S.T
     found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if found is None:
         return None
-    # M, K and D are symmetric, so the system with the output S^T s is the dual of the system with
-    # the input matrix S. Each motion (s, v) that this output does not observe gives one combination
-    # of states on which no input acts: the row (s^T D + v^T M, s^T M).
+    # M, K and D are symmetric, because `unobservable` returns None otherwise. So the system with
+    # the output S^T s is the dual of the system with the input matrix S. For each motion (s, v)
+    # that this output does not observe, the row (s^T D + v^T M, s^T M) is an uncontrollable
+    # combination of states.
     motions, shapes, fixed = found
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
@@ -267,8 +269,8 @@ def _by_second_order(
     if system.D.values.any():
         rows = np.hstack((rows[:, :r] @ to_s, rows[:, r:]))
         return controllable, rows, None, "eigenvalues", fixed
-    # Without damping, the states on which no input acts are modal coordinates of vibrations and
-    # instabilities, and the rates of these coordinates.
+    # Without damping, the uncontrollable combinations of states are modal coordinates of vibrations
+    # and instabilities, and the rates of these coordinates.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
     read, names = [np.zeros((0, 2 * r))], list[str]()
     for pole, of_pole in shapes:
@@ -352,7 +354,7 @@ def _conclude(
 
 
 def _root(W: Array) -> Array:
-    """Return L (m, m) with W = L L^T, for a semidefinite W whose entries have different units."""
+    """Return L with W = L L^T, for a positive semidefinite W (m, m) with entries of any units."""
     # The condition number of L is the square root of the condition number of W, so the rank of L is
     # easier to decide than the rank of W.
     size = ranks.divisors(np.sqrt(W.diagonal()))
@@ -374,8 +376,9 @@ def _reached(
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
-    # rounding error. Poles therefore count as equal if they are closer than 1e-3 times the largest
-    # modulus of a pole. For discrete-time poles z, the modulus of z - 1 replaces this modulus.
+    # rounding error. Poles closer than 1e-3 `size` therefore count as equal, and poles closer than
+    # this to the stability boundary count as marginally stable. `size` is the largest modulus of a
+    # pole, or of z - 1 for discrete-time poles z.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & unstable
     for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:

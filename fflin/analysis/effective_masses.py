@@ -15,8 +15,9 @@ from fflin.linear.model import LinearModel
 # Two frequencies count as equal if their relative difference is at most this.
 _EQUAL = 1e-9
 
-# Effective masses and moments of inertia below this fraction of the total are rounding error. The
-# code computes singular values, whose squares are the effective masses and moments of inertia.
+# In `_separated`, the squares of singular values are effective masses or moments of inertia. A
+# square is a rounding error if it is at most this fraction of the sum over all modes. In the
+# tables, a value is a rounding error if it is at most 100 times this fraction of the total.
 _ROUNDING = 1e-14
 
 

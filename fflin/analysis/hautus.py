@@ -1,9 +1,9 @@
 """Controllable and observable subspaces by the Popov-Belevitch-Hautus test, pole by pole.
 
-`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - s I, B] at
-each pole s. `unobservable` tests a second-order system M a + D v + K s = 0 with the output C_s s +
-C_v v, by the null space of [p^2 M + p D + K; C_s + p C_v] at each pole p. The test of second-order
-systems is less sensitive to rounding.
+`split_by_poles` tests any pair (A, B), or the dual pair (A^T, C^T), by the rank of [A - p I, B] at
+each pole p. `unobservable` tests a second-order system M a + D v + K s = 0 with the positions s and
+the output C_s s + C_v v, by the null space of [p^2 M + p D + K; C_s + p C_v] at each pole p. The
+test of second-order systems is less sensitive to rounding.
 """
 
 from operator import itemgetter
@@ -14,22 +14,24 @@ from fflin.analysis import ranks
 from fflin.analysis.mechanics import SecondOrder, rates_of_positions
 from fflin.base.validation import Array, Values
 
-# Singular values of [A - s I, B] are computed only at suspicious eigenvalues s of A. The columns of
-# B have unit length. An eigenvalue is suspicious if another eigenvalue is closer to it than
-# _SUSPICIOUS. It is also suspicious if its left eigenvector y is nearly orthogonal to these
-# columns: |y^H B| < _SUSPICIOUS. The refinement of a pole stops if the smallest singular value
+# Singular values of [A - s I, B] are computed only at s = 0 and at suspicious eigenvalues s of A.
+# The columns of B have unit length. An eigenvalue is suspicious if another eigenvalue is closer to
+# it than _SUSPICIOUS. It is also suspicious if its left eigenvector y is nearly orthogonal to the
+# columns of B: |y^H B| < _SUSPICIOUS. The refinement of a pole stops if the smallest singular value
 # exceeds _SUSPICIOUS, because this singular value is then certainly not zero.
 _SUSPICIOUS = 1e-3
 
 # Rounding splits a multiple eigenvalue into several poles, which are refined separately. Refined
 # poles closer than _SAME_POLE therefore count as one pole. If two unobservable poles of a
 # second-order system are closer than _DEFECTIVE, they may be one defective pole. A defective pole
-# has too few eigenvectors for the test.
+# has too few eigenvectors for the test. In second-order systems, both distances are relative to the
+# modulus of the pole.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# The Rayleigh quotient of a singular vector refines a pole. The refinement converges quadratically,
-# so _REFINEMENTS steps are enough. A pole of a second-order system is refined in at most twice as
-# many steps. Its refinement also stops if a step is larger than _NEAR times the pole.
+# `_left_vectors` refines a pole by the Rayleigh quotient of a singular vector. The refinement
+# converges quadratically, so _REFINEMENTS steps are enough. `_missed_shapes_at` refines a pole of a
+# second-order system in at most twice as many steps. It also stops the refinement if a step is
+# larger than _NEAR times the modulus of the pole.
 _REFINEMENTS, _NEAR = 4, 0.1
 
 # Two poles are aliased if their difference times dt is closer than this to a nonzero multiple of 2
@@ -37,9 +39,10 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # model.
 _ALIASED = 1e-6
 
-# A pole may belong to a defective pair at zero if its decay rate is below this, in the unit of time
-# of `split_by_poles`. Rounding moves such a pair by the square root of the rounding error. For
-# discrete-time poles z, the decay per sample, 1 - abs(z), replaces the decay rate.
+# A pole counts as decaying only if its decay rate exceeds this, with time in the unit that
+# `split_by_poles` chooses. Rounding moves a defective pair of zero poles by the square root of the
+# rounding error, so a slower pole may belong to such a pair. For discrete-time poles z, the decay
+# per sample, 1 - abs(z), replaces the decay rate.
 _DECAY = 1e-7
 
 # If a motion decays to less than this fraction within one sample, only its rounding error remains.
@@ -49,14 +52,17 @@ _DEAD = 1e4 * ranks.EPS
 def split_by_poles(
     X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False
 ) -> tuple[Array, Array, Array, ranks.FixedPoles]:
-    """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s.
+    """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s of A.
 
     Return four results:
 
     - a basis (nx, d) of the controllable subspace;
-    - a basis (nx, nx - d) of a complement, which is the unobservable subspace if `dual`;
-    - a matrix (nx - d, nx), whose rows are combinations of states on which no input acts;
+    - a basis (nx, nx - d) of a complement of this subspace;
+    - a matrix (nx - d, nx), each row of which is an uncontrollable combination of states;
     - the fixed poles.
+
+    If `dual`, the pair (A^T, C^T) replaces (A, B). The second result is then a basis of the
+    unobservable subspace, and the first and third results have no meaning.
     """
     # X is A, or (A - I)/dt of a sampled model. The matrix `drive` is B, or C^T of the dual pair.
     # The states x = to_x xi are scaled to states xi in units of energy. Velocities nu become
@@ -83,8 +89,8 @@ def split_by_poles(
     stretch = np.repeat((unit, 1.0), nv)
     to_x, from_x = to_x * stretch, from_x / stretch[:, None]
     A = unit * A * stretch / stretch[:, None]
-    # The tolerance is twenty times the rounding error of M^-1. For a sampled model it is at least
-    # twenty times the rounding error of (A - I)/dt.
+    # `noise` is the relative rounding error of M^-1. For a sampled model, it is at least the
+    # rounding error of (A - I)/dt. The tolerance of the rank decisions is twenty times `noise`.
     root = np.sqrt(M.diagonal())
     noise = len(X) * ranks.EPS * float(np.linalg.cond(M / np.outer(root, root)))
     if dt:
@@ -113,8 +119,8 @@ def split_by_poles(
         least, most = int(decay.argmin()), int(decay.argmax())
         slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
         if dt and abs(poles[most]) < _DEAD:
-            # If two motions decay to rounding error within one sample, the samples cannot
-            # distinguish these motions.
+            # The motion `shapes[:, most]` decays to rounding error within one sample. The samples
+            # cannot distinguish two such motions, so the rank is undecided.
             dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
             margin &= dead.transformed(1.0, halved=True)
         settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
@@ -169,8 +175,9 @@ def unobservable(
 ) -> tuple[Array, tuple[tuple[complex, Values], ...], ranks.FixedPoles] | None:
     """Return the motions for which ``position @ s + velocity @ ds/dt`` stays zero.
 
-    The motions are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p, where
-    C_s is `position` and C_v is `velocity`. Return three results:
+    At each nonzero pole p, the shapes of these motions are the null space of
+    :math:`[p^2 M + p D + K; C_s + p C_v]`, where C_s is `position` and C_v is `velocity`. Return
+    three results:
 
     - a basis (2 nv, k) of these motions (s, ds/dt);
     - the nonzero poles of these motions in continuous time, one of each conjugate pair, each with
@@ -180,10 +187,10 @@ def unobservable(
     Return None if the test is inconclusive, that is, if K or D is not symmetric, D is indefinite,
     sampling aliases two poles, or a pole is defective.
     """
-    # The motions of the pole zero are s + t v, with K s = K v = D v = 0. Such a motion is
-    # unobservable if C_s v = 0 and C_s s + C_v v = 0. With C_s = S^T and C_v = 0, this function
-    # also finds the motions that the input matrix S does not control, because M, D and K are
-    # symmetric.
+    # A motion with the pole zero has the position s + t v at the time t, with K s = K v = D v = 0.
+    # Such a motion is unobservable if C_s v = 0 and C_s s + C_v v = 0. With C_s = S^T and C_v = 0,
+    # this function also finds the motions that the input matrix S does not control, because M, D
+    # and K are symmetric.
     if not system.symmetric:
         return None
     starts, margin = system.poles
@@ -248,8 +255,8 @@ def _missed_shapes_at(
     """Return the unobservable shapes (nv, k) at a pole, the refined pole, and the rank margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(2 * _REFINEMENTS):
-        # Scale each row by the size of its terms, so that a slow mode keeps its accuracy next to a
-        # fast mode.
+        # Scale each coordinate by the size of its terms in s^2 M + s D + K, so that a slow mode
+        # keeps its accuracy next to a fast mode.
         s = pole if pole.imag else pole.real
         size = abs(s)
         weight = np.sqrt(
@@ -276,7 +283,7 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
     """Solve the quadratic equation of a mode shape for the pole nearest to `near`."""
     left = shape
     if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
-        left = shape.conj()  # shape^T M shape may vanish if poles are equal
+        left = shape.conj()  # shape^T M shape may vanish if two poles are equal
     a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
     root = np.sqrt(complex(b * b - 4.0 * a * c))
     q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0

@@ -34,7 +34,11 @@ _SLOWEST = 3e-6
 
 
 def checked(lin: LinearModel) -> LinearModel:
-    """Return the model if its states are positions and their rates, or raise `InputError`."""
+    """Return the model, or raise `InputError` if its states are not positions and their rates.
+
+    Also raise `InputError` if A, B, C or D has entries that are not finite. Warn if the orbital
+    effects in A may be lost in rounding errors.
+    """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     nx = len(lin.A)
@@ -46,7 +50,7 @@ def checked(lin: LinearModel) -> LinearModel:
     for name in "ABCD":
         if not np.isfinite(getattr(lin, name)).all():
             raise InputError(f"{name} of the model has entries that are not finite")
-    # Orbital effects may be smaller than the rounding error of a fast vibration.
+    # Orbital effects in A may be smaller than the rounding errors that a fast vibration causes.
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
     fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
@@ -96,7 +100,7 @@ class SecondOrder:
 
     @property
     def acting(self) -> bool:
-        """Whether there are springs or dampers."""
+        """Whether K or D has nonzero entries, for example from springs or dampers."""
         return bool(self.K.values.any() or self.D.values.any())
 
     @cached_property
@@ -137,9 +141,9 @@ class SecondOrder:
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the second-order form of a model, continuous or sampled."""
     # K, D and S are products with M, so rounding errors remain in entries that should be zero.
-    # Entries below a threshold are therefore set to zero. In units of energy, the threshold is a
-    # fraction of the largest entry of the matrix for K and D, and a fraction of the norm of the
-    # column for S.
+    # `without_rounding` sets an entry to zero if it is clearly below a bound on its rounding error.
+    # For K and D, this bound is at least a fraction of the largest entry of the matrix, in units of
+    # energy. For S, the norm of the column replaces the largest entry.
     nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
@@ -149,7 +153,8 @@ def second_order(lin: LinearModel) -> SecondOrder:
         spread[:, : 2 * nv] += 4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     noise = np.abs(M) @ spread
     # In a spin, forces that balance each other leave rounding errors in K and D. If no other forces
-    # act, the size of these errors cannot be seen in K and D. It is estimated from the spin rate.
+    # act, the size of these errors cannot be seen in K and D. It is therefore estimated from
+    # `spin`, the largest angular rate of the base and the joints.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
@@ -336,7 +341,8 @@ def undecided(
 def shape(lin: LinearModel, at: Values) -> str:
     """Describe a motion by its largest coordinates.
 
-    The vector `at` (nv,) contains the rates of all coordinates in this motion, real or complex.
+    The vector `at` (nv,), real or complex, contains the displacements or the rates of all
+    coordinates in this motion.
     """
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]

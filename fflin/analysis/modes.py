@@ -20,9 +20,9 @@ from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
-# With coordinates scaled to unit inertias, a stiffness below this fraction of the largest stiffness
-# counts as zero. Modes below about 3e-7 times the highest frequency therefore count as rigid-body
-# modes.
+# With coordinates scaled to unit inertias, a stiffness counts as zero if it is at most nx times
+# this fraction of the largest stiffness. Modes below about 3e-7 sqrt(nx) times the highest
+# frequency therefore count as rigid-body modes.
 _NO_STIFFNESS = 1e-13
 
 
@@ -218,7 +218,7 @@ class Modes:
         return "\n\n".join((*parts, *self._of_appendages()))
 
     def _of_appendages(self) -> list[str]:
-        """Return two tables for a robot with flexible appendages, or an empty list.
+        """Return two tables for a robot with flexible appendages or slosh, or an empty list.
 
         The first table lists two frequencies of each mode: the frequency if the link that carries
         the appendage is free, and the frequency if this link is clamped. The second table contains
@@ -402,9 +402,9 @@ def nonzero_eigenpairs(
     steps end when A is nonsingular.
     """
     # Rounding moves the k zero eigenvalues of a Jordan block by the k-th root of the rounding
-    # error. Zero eigenvalues are therefore removed before the others are computed. The caller
-    # scales A (n, n) so that its entries are comparable. Singular values of at most n * tolerance
-    # count as zero.
+    # error. Zero eigenvalues are therefore removed before the others are computed. Singular values
+    # of at most n * tolerance count as zero. So the caller must scale A (n, n) so that its largest
+    # entries are about 1.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
@@ -426,8 +426,8 @@ def nonzero_eigenpairs(
     if not len(A):
         return [], nullity
     values, right = np.linalg.eig(A)
-    # The left eigenvectors y are scaled to y x = 1. If A is defective, `right` has no inverse, so
-    # the pseudoinverse is used.
+    # The left eigenvector y of each right eigenvector x is scaled to y x = 1. If A is defective,
+    # `right` has no inverse, so the pseudoinverse is used.
     left = np.linalg.pinv(right, rcond=EPS)
     pairs: list[tuple[complex, Values, float]] = []
     for value, y, x in zip(values.tolist(), left, right.T, strict=True):
@@ -442,7 +442,7 @@ def nonzero_eigenpairs(
         # Slow modes lose accuracy in these steps; one inverse iteration restores the accuracy.
         if np.linalg.norm(whole @ x - value * x) > 1e2 * EPS * abs(value):
             near = whole - (value + EPS * size) * np.eye(n)
-            with suppress(np.linalg.LinAlgError):  # singular if the shift is an eigenvalue
+            with suppress(np.linalg.LinAlgError):  # `near` may be exactly singular
                 x = np.linalg.solve(near, x)  # noqa: PLW2901
         pairs.append((complex(value), x / np.linalg.norm(x), error))
     return pairs, nullity

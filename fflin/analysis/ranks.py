@@ -147,6 +147,8 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     """Set entries that are rounding errors to zero.
 
     Entries are compared in units of energy. The unit of entry (i, j) is ``rows[i] * columns[j]``.
+    The noise of entries near the threshold is raised, so that a rank that depends on such an entry
+    counts as undecided.
     """
     units = rows[:, None] * columns
     size = np.abs(forces.values)
@@ -159,7 +161,11 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
 def right_vectors(
     values: Values, noise: Array, states: int = 1
 ) -> tuple[Array, Values, int, Margin]:
-    """Return singular values (n,), right singular vectors (n, n), the rank, and its margin."""
+    """Return singular values (n,), right singular vectors (n, n), the rank, and its margin.
+
+    They refer to the matrix `values` (m, n) with scaled rows. `noise` (m, n) bounds the rounding
+    errors of its entries.
+    """
     # Rows are scaled to unit length, so that a large row does not hide a small one. A row with a
     # large rounding error is scaled to a smaller length, so that it does not hide other rows.
     n = values.shape[1]
@@ -221,8 +227,8 @@ def echelon(
 ) -> tuple[Array, Indices]:
     """Return a basis (m, r) of the column space with I in its pivot rows, and the pivots (r,).
 
-    `weights` (m,) make the rows comparable. Rows for which `preferred` is true become pivots if
-    possible.
+    `columns` (m, r) must be linearly independent. `weights` (m,) make the rows comparable. Rows for
+    which `preferred` is true become pivots if possible.
     """
     from scipy.linalg import qr
 

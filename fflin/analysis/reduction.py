@@ -23,7 +23,8 @@ from fflin.robot.robot import Robot
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
 
-# A value below this fraction of the largest value is rounding error.
+# Entries of A below this are rounding errors. So are singular values below this of a matrix that
+# consists of rows of an orthonormal basis.
 _ROUNDING = 1e-9
 
 # `momentum_reduction` requires that the part of f0 which the reduced states cannot represent is at
@@ -254,10 +255,10 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return two index arrays of wheels whose states do not affect the other states.
+    """Return two index arrays of wheels whose angles do not affect the other states.
 
-    The first array contains the wheels whose angle has no effect on the other states. The second
-    array contains those wheels of the first array whose speed has no effect either.
+    The first array contains all such wheels. The second array contains those of them whose speeds
+    do not affect the other states either.
     """
     # A wheel speed affects other states if the link that carries the wheel rotates at the operating
     # point, or if the wheel has friction.
@@ -272,10 +273,12 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # Some combinations of inputs change the wheel speeds but exert no net force on the rigid
-    # motions of the other bodies. A design can regulate as many wheel speeds as these combinations
-    # can change independently; the other `ignorable_wheels` are removed. By default, all
-    # `ignorable_wheels` are removed unless an input, such as a thruster, exerts an external torque.
+    # `free` contains the wheels whose angles and speeds do not affect the other states. Some
+    # combinations of inputs change the speeds of these wheels but exert no net force on the rigid
+    # motions of the other bodies. If `wheel_speeds` is true, as many wheels are kept as these
+    # combinations can spin independently, and the others in `free` are removed. If `wheel_speeds`
+    # is false, all wheels in `free` are removed. By default, `wheel_speeds` is true if an input,
+    # such as a thruster, exerts a torque on the whole robot.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -378,8 +381,9 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Record the model from which the reduced model `part` inherits its certificate.
 
-    By default, this is the unreduced model `lin`. If `lin` was sampled from a known continuous
-    model, it is the reduced model that `make` forms from the continuous model.
+    By default, the recorded model is the unreduced model `lin`. If `lin` was sampled from a known
+    continuous model, the recorded model is the reduced model that `make` forms from the continuous
+    model.
     """
     source = lin.generator
     whole = lin if not lin.dt or source is None else make(source)

@@ -1,4 +1,4 @@
-"""Accelerations and their derivatives by the articulated-body algorithm, to check models."""
+"""Accelerations and their derivatives by ABA, for simulations and for checks of linear models."""
 
 import numpy as np
 import pinocchio as pin
@@ -29,7 +29,7 @@ class Aba:
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
         """Return dv/dt (nv,) in Pinocchio's order.
 
-        A torque and force on the base in `u` are in base axes. `tau` (nv,) is an additional
+        In `u`, the torque and force on the base are in base axes. `tau` (nv,) is an additional
         generalised force in Pinocchio's order.
         """
         forces = self.actuation.fixed @ u
@@ -57,7 +57,10 @@ class Aba:
         return found
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
-        """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms."""
+        """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms.
+
+        The sum excludes the gravity gradient, and gyroscopic torques of wheels without inertia.
+        """
         state, data = self.state, self._data
         M = state.project(pin.crba(self._model, data, q).T)
         columns = self.actuation.columns(data, q)
@@ -68,8 +71,8 @@ class Aba:
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of dnu/dt with respect to the tangent of q, to nu and to u.
 
-        The derivatives (6 + n, ..) are in state order. A torque and force on the base in `u` are in
-        base axes.
+        The derivatives (6 + n, ..) are in state order. In `u`, the torque and force on the base are
+        in base axes.
         """
         # Wrenches of thrusters are constant in the frames of their links, so the derivative with
         # respect to q includes d(B u)/dq. The derivatives with respect to u are the accelerations
@@ -94,8 +97,8 @@ class Aba:
         for joint, momentum in state.robot.stored_momentum:
             pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, at_rest)
             local = self._model, self._data, joint, pin.ReferenceFrame.LOCAL
-            # Derivatives of the link's angular velocity with respect to q and v, in the link's
-            # axes.
+            # Derivatives, with respect to q and v, of the angular velocity of the link that carries
+            # the wheel. They are in the axes of this link.
             turning, jacobian = (x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local))
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
@@ -149,7 +152,10 @@ class Aba:
     def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the derivatives of dnu/dt with respect to q, v and force, for mimic joints."""
+        """Return the derivatives of dnu/dt for a robot with mimic joints, in state order.
+
+        The derivatives are with respect to q, to v and to generalised forces. S is `StateMap.S`.
+        """
         # The accelerations satisfy S^T M S nudot = S^T (tau - b), without the constraint forces of
         # mimic joints. ABA requires an invertible M, but M is singular if a mimic joint or its
         # leader moves no mass. Therefore each mimic joint and each leader gets a rotor. The inertia

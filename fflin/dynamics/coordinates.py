@@ -115,7 +115,7 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True)
 class Chart:
-    """Attitude chart of section 1, evaluated at one or many attitudes of the base.
+    """Attitude chart (section 1 of docs/derivation.md) at one or many attitudes of the base.
 
     The attitudes are relative to the reference. refMb is the placement of the base relative to the
     reference.
@@ -124,7 +124,7 @@ class Chart:
     standing: ClassVar[bool] = False  # whether all attitudes are equal to the reference
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
-    q0: float | Array  # scalar part (.., 1) of this quaternion, positive
+    q0: float | Array  # scalar part (.., 1) of this quaternion, at least 0
     R: Array  # refMb.rotation (.., 3, 3)
 
     @classmethod
@@ -231,8 +231,8 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
 def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
     """Remove full turns of continuous joints from states or state errors x (.., nx), in place.
 
-    Afterwards, the angle of each continuous joint is within half a turn of the entry of the state
-    `near` (nx,) for this joint, or of the angle `near` if it is a number. Return x.
+    Afterwards, the angle of each continuous joint is within half a turn of the angle of this joint
+    in the state `near` (nx,). If `near` is a number, it is this angle for all joints. Return x.
     """
     joints = 6 + state.unbounded
     apart = x[..., joints] - np.broadcast_to(near, state.nx)[joints]

@@ -36,8 +36,9 @@ class Integrator:
     moments: ClassVar[tuple[float, ...]]
     # Stability limit: a negative real pole is integrated stably up to this value of h |pole|.
     reach: ClassVar[float]
-    # After each stage, a displacement leads to the next configuration. For each displacement, this
-    # is the index of the stage whose configuration it starts from. The first stage has the index 0.
+    # After each stage, a displacement leads to the next configuration. For each displacement,
+    # `origins` contains the index of the stage at whose configuration the displacement starts. The
+    # first stage has the index 0.
     origins: ClassVar[tuple[int, ...]]
     # Weights of h v, h^2 l1, h^2 l2, ... in each displacement. The last displacement has no
     # entry in `origins`, because it starts from the result of the displacement before it.
@@ -49,7 +50,7 @@ class Integrator:
         self.model, self.dt = model, dt
         self._displacement, self._speed = self.step_weights(dt)
         self._integrate = _integrate if rows is None else integrate_rows
-        # v, l1, l2, ...
+        # The rows v, l1, l2, ... of a step.
         self._stages = np.zeros((*(() if rows is None else (rows,)), 1 + len(self.nodes), model.nv))
 
     @classmethod
@@ -173,9 +174,13 @@ def held_derivatives(
 
 
 def held_cost(F: Array, W: Array, h: float | Array) -> Array:
-    """Return the integral of e^(F^T t) W e^(F t) over [0, h]; F and h may have leading axes."""
-    # The exponential of the matrix `block` is computed, which contains W and F. Its rounding errors
-    # are relative to the largest block of the matrix. So W is scaled to the norm of F.
+    """Return the integral of e^(F^T t) W e^(F t) over t from 0 to h, for F (.., n, n) and h (..).
+
+    W (n, n) must be symmetric.
+    """
+    # The integral follows from the exponential of the matrix `block`, which contains W and F. The
+    # rounding errors of the exponential are relative to the largest entries of `block`. So W is
+    # scaled to the norm of F.
     from scipy.linalg import expm
 
     h, n = np.asarray(h)[..., None, None], F.shape[-1]

@@ -125,9 +125,9 @@ class OrbitField:
     def slopes(self, data: pin.Data) -> Array:
         """Return derivatives (nv, nv) of the generalised force of `wrenches` with respect to q.
 
-        Only the wrenches vary with q. The Jacobians of the bodies are held constant, because the
-        ABA derivatives include their change. The columns for the base position are zero here,
-        because `add_turning` adds the effect of this position.
+        In these derivatives, only the wrenches vary with q. The Jacobians of the bodies are held
+        constant, because the ABA derivatives include their change. The columns for the base
+        position are zero here, because `add_turning` adds the effect of this position.
         """
         # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body, in its
         # own axes, changes T by T [t]x - [t]x T.
@@ -149,10 +149,10 @@ class OrbitField:
         return total
 
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and the inertial v for the same robot with its base at the frame's origin.
+        """Return q with q[:3] = 0, and the inertial v with zero linear velocity of the base.
 
-        The linear velocity of the base is zero in the result. The position and the linear velocity
-        of the base do not change the accelerations c in (14.2).
+        The position and the linear velocity of the base do not change the accelerations c in
+        (14.2).
         """
         q, v = q.copy(), self.absolute(q, v)
         q[:3] = v[PIN_LINEAR] = 0.0
@@ -167,9 +167,10 @@ class OrbitField:
         R, position = self.base(q)
         fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
-        # The next lines differentiate the relative accelerations (14.2), which are c_w + w x spin
-        # and c_v + fall - 2 spin x v - w x v. Here (c_w, c_v) is the inertial acceleration at the
-        # point of `near`, and w and v are the velocities of the base relative to the frame.
+        # The next lines differentiate the relative accelerations (14.2), which are c_w + w x s and
+        # c_v + fall - 2 s x v - w x v. Here s is `rate` in base axes, and (c_w, c_v) is the
+        # inertial acceleration at the point that `near` returns. The velocities w and v of the base
+        # are relative to the frame. The matrices `spin`, `W` and `V` are [s]x, [w]x and [v]x.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
@@ -207,8 +208,8 @@ class OrbitField:
         return R, origins[..., None] + R @ self._lever
 
 
-# Weights of (14.4), divided by n^2, of the rotations about the radial direction, the direction of
-# flight and the orbit normal.
+# Weights in (14.4), divided by n^2. The three weights are for rotations about the radial direction,
+# the direction of flight and the orbit normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 
 
@@ -221,8 +222,10 @@ class GravityGradient(NamedTuple):
     """
 
     turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation
-    spin: Array  # (3,) rate of the frame [rad/s]
-    fall: Array  # (3,) acceleration of the base's origin in the rotating frame [m/s^2]
+    spin: Array  # angular velocity (3,) of the orbital frame [rad/s]
+    # Acceleration (3,) [m/s^2], relative to the orbital frame, of a free mass that is at rest in
+    # this frame at the base's origin.
+    fall: Array
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
@@ -236,7 +239,8 @@ class GravityGradient(NamedTuple):
     def force(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array, Array]:
         """Return the generalised force P (nv,) of the field at q, with its derivatives (14.4).
 
-        In q, the base must be at the origin, so that P excludes the free fall of the base's origin.
+        P excludes the free fall of the base's origin, and does not depend on the base pose in q.
+        The base in q should be at the world's origin, because digits are lost if it is far away.
         The second result (nv, nv) contains the derivatives with respect to q, for a field that is
         constant in base axes. The third result (nv, 3) contains the derivatives with respect to
         rotations of the base.

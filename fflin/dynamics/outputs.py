@@ -44,7 +44,7 @@ class Point(NamedTuple):
 
     model: pin.Model
     data: pin.Data
-    q: Array  # (nq,) with the base at the world's origin and in the world's axes
+    q: Array  # (nq,) with the base at the world's origin and aligned with the world's axes
     v: Array  # (nv,) without the linear velocity of the base
     R: Array  # rotation (3, 3) of the base relative to the reference
     r_b: Array  # position (3,) of the base relative to the reference
@@ -53,7 +53,7 @@ class Point(NamedTuple):
     # (joint, momentum) for each wheel that is modelled without a joint of its own. The wheel is
     # mounted on this joint, and its angular momentum (3,) is in the axes of the joint.
     stored: tuple[tuple[int, Array], ...]
-    spin: Array  # (3,) angular velocity of the orbit frame in base axes
+    spin: Array  # angular velocity (3,) of the orbital frame in base axes; zero without an orbit
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame of the moved robot in the world."""
@@ -139,8 +139,9 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    # The velocity is the sum of two terms. The first is rotated from the axes of the frame, and the
-    # second, v_b, from base axes. The skew terms are the derivatives of these two rotations.
+    # The linear velocity of the frame is the sum of `velocity.linear`, which is in the axes of the
+    # frame, and v_b, which is in base axes. R and `at.R` rotate these two terms to reference axes.
+    # The skew terms are the derivatives of these two rotations.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
@@ -164,7 +165,7 @@ def _gyroscope_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     _angular_derivatives(at, to, frame)
     spin = at.placement(frame).rotation.T.dot(at.spin)
     to.y[:] += spin
-    to.by_q[:] += skew(spin).dot(to.by_v)  # the frame's angular Jacobian
+    to.by_q[:] += skew(spin).dot(to.by_v)  # `to.by_v` is the angular Jacobian of the frame
 
 
 def _gyroscope(world: Measuring, _: object, frame: Carried) -> Array:
@@ -180,8 +181,9 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
-    # The next terms are the derivatives of -g, which is constant in world axes, and of
-    # omega_b x v_b.
+    # The next terms are the derivatives of -g with respect to a rotation of the base, and of
+    # omega_b x v_b with respect to omega_b. The vector g is constant in world axes. The derivative
+    # with respect to v_b is already in `by_v`.
     of_base = by_a[:, PIN_LINEAR]
     to.by_q[:, PIN_ANGULAR] -= of_base.dot(skew(at.g))
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))

@@ -14,7 +14,7 @@ from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, by_joint
 from fflin.robot.robot import Robot
 
-LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squares and their sums do not overflow
+LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squared speeds and their sums do not overflow
 
 
 def configuration(
@@ -111,7 +111,10 @@ def point_of(
     v0: ArrayLike | None,
     default: Callable[[], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
-    """Return q (nq,) and v (nv,) from x0, or from q0 and v0, or from `default` if all are None."""
+    """Return q (nq,) and v (nv,) from x0, or from q0 and v0, or from `default` if all are None.
+
+    If only q0 is given, v is zero. If only v0 is given, q is neutral.
+    """
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
@@ -158,7 +161,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
-            robot.joint(name)  # its error says why the joint has no velocity
+            robot.joint(name)  # raises an error that explains why the wheel has no velocity
     rates = rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 

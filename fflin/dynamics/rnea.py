@@ -78,9 +78,10 @@ class Inertia:
         at configurations at which it is accurate.
         """
         still = self.centred(q)
-        # The rounding errors of the articulated-body inverse would appear in entries of M^-1 K that
-        # should be exactly zero, where K is the stiffness. So robots with springs need a Cholesky
-        # factor, whose relative rounding errors do not depend on the scaling of M.
+        # For a robot with springs or dampers, `quick` should be false, because the articulated-body
+        # inverse leaves rounding errors in entries of M^-1 K that should be exactly zero. Here K is
+        # the stiffness. A Cholesky factor has relative rounding errors that do not depend on the
+        # scaling of M.
         bounds = self._bounds if quick else None
         if bounds is not None and (
             not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
@@ -133,8 +134,10 @@ class Inertia:
 def _invert_dense(M: Array, out: Array) -> None:
     from scipy.linalg.lapack import dpotrf, dpotri
 
+    # `dpotri` returns the upper triangle of the inverse, and zeros below the diagonal. If M is not
+    # positive definite, `upper` is NaN.
     factor, failed = dpotrf(M)
-    upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]  # zero below its diagonal
+    upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]
     np.add(upper, upper.T, out=out)
     out.flat[:: len(M) + 1] *= 0.5
 
@@ -148,8 +151,8 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     # By the parallel axis theorem, the moment of inertia of a body about the base's origin is at
     # most its largest principal moment plus m r^2. Here m is the mass of the body, and r is the
     # distance of its centre of mass from the base's origin. This distance is at most the length of
-    # the path from joint to joint to the centre of mass, with a displacement of `STROKE` at each
-    # prismatic joint.
+    # the path from the base's origin through the joints to the centre of mass, with a displacement
+    # of `STROKE` at each prismatic joint.
     joints, parents = model.joints.tolist(), model.parents.tolist()
     kinds = ["", "", *(joint.shortname()[:11] for joint in joints[ROOT + 1 :])]
     if not {*kinds} <= {"", "JointModelR", "JointModelP"}:
@@ -182,12 +185,12 @@ class AccelerationDerivatives(NamedTuple):
     The arrays have leading axes (..) if there are several points.
     """
 
-    c: Array  # (.., 6 + n): without gravity and omega_b x v_b, see (3.2)
+    c: Array  # (.., 6 + n); dnu/dt follows from c by (3.2), or by (14.2) in orbit
     # Derivatives (.., 6 + n, 12 + 2 n) of c with respect to displacements of the state. The
     # displacements are in base axes.
     slopes: Array
-    by_u: Array  # D_u (.., 6 + n, nu) of (3.3), u in base axes
-    gravity: Array  # (.., 3) in base axes
+    by_u: Array  # D_u (.., 6 + n, nu) of (3.3), for u in base axes
+    gravity: Array  # (.., 3) [m/s^2] in base axes; `GravityGradient.fall` in orbit
 
     @property
     def by_turn(self) -> Array:
@@ -219,10 +222,10 @@ class Accelerations:
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
         # `rows` contains the derivatives, at constant c, of M c + b - B_u u minus the forces of
-        # springs and dampers. Each row contains the derivative with respect to one coordinate of a
-        # displacement of the state, so the rows for q_m and nu are contiguous. The first three rows
-        # are for the attitude of the base, and are zero without an orbit. The next three rows are
-        # for its position, and are always zero.
+        # springs and dampers. Each row contains the derivative with respect to one component of the
+        # state displacement, so the blocks for q_m and for nu are C-contiguous. The first three
+        # rows are for the attitude of the base, and are zero without an orbit. The next three rows
+        # are for the position of the base, and are always zero.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
         self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
