@@ -27,7 +27,8 @@ _BLOCK = 2048
 # depend on the chunk in which it is read.
 _DRAWN = 4096
 
-# Range of a revolute joint without limits [rad].
+# Range of a revolute joint without limits [rad]. Limits that include -2 pi to 2 pi count as no
+# limits.
 _TURN = (-math.pi, math.pi)
 
 
@@ -263,11 +264,11 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
 def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
     """Return checked configurations of a robot: a new array, a grid or random configurations.
 
-    The rows of the array (N, nq) are corrected so that they satisfy `Robot.checked_configuration`.
+    Each row of an array (N, nq) is checked and corrected as in `Robot.checked_configuration`.
     """
     if isinstance(q, Grid | RandomConfigurations):
-        # The points may have been made for a robot with other inputs or outputs, but with the same
-        # joints.
+        # The points may have been made for another robot, for example one with other inputs. Both
+        # robots must have the same joints.
         if q.robot.joints != robot.joints:
             raise InputError(
                 f"q was made for '{q.robot.name}', whose joints differ from the joints of "

@@ -1,9 +1,9 @@
 """Storage of arrays with many rows: memory, .npz files, and HDF5 files that are read on demand.
 
-An HDF5 file has one dataset per array, and two datasets of checksums. ``chunk_sha256`` contains the
-checksum of each chunk of rows; the file attribute ``chunk`` is the number of rows in a chunk.
-``sha256`` contains one checksum of ``chunk_sha256``, ``chunk``, the constant arrays, and all
-strings except ``request``.
+An HDF5 file has one dataset per array. A file with checksums has two more datasets.
+``chunk_sha256`` contains the checksum of each chunk of rows; the file attribute ``chunk`` is the
+number of rows in a chunk. ``sha256`` contains one checksum of ``chunk_sha256``, ``chunk``, the
+constant arrays, and all strings except ``request``.
 """
 
 from __future__ import annotations
@@ -175,7 +175,8 @@ class MemoryStore:
         shapes: Mapping[str, tuple[int, ...]],
         given: Mapping[str, Array] | None = None,
     ) -> None:
-        self.count, self.chunk, self.arrays = count, chunk, dict(given or {})  # not copied
+        # The arrays in `given` are not copied.
+        self.count, self.chunk, self.arrays = count, chunk, dict(given or {})
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
                 raise MemoryError
@@ -338,7 +339,8 @@ class FileStore:
 def _reserve(path: Path, size: int) -> None:
     """Reserve `size` bytes of disk space for a file.
 
-    The space is reserved because HDF5 can crash the process if the disk is full.
+    The space is reserved because HDF5 can crash the process if the disk is full. Systems without
+    `posix_fallocate` reserve no space.
     """
     with path.open("ab") as file:
         if hasattr(os, "posix_fallocate"):
@@ -349,7 +351,7 @@ def _memory() -> float:
     """Return the size of the machine's memory [bytes], or infinity if it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):  # not on this system
+    except (AttributeError, ValueError, OSError):  # this system does not report the size
         return math.inf
 
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
-# Placement of a free-flyer joint that coincides with the root frame: position and quaternion.
+# Identity placement of the free-flyer joint in Pinocchio's universe frame: position, then
+# quaternion x, y, z, w.
 AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 # Largest difference between joint values that count as equal [rad|m].
@@ -107,8 +108,8 @@ class LinearBatch(validation.Result):
     fflin_version: str
     pinocchio_version: str
     columns: tuple[tuple[int, int, float], ...]
-    # _x0 is None if all points are at rest, because x0 then follows from q. _y0 is None if the
-    # output is the state.
+    # _x0 is None if A is the same at all points, as for a robot at rest without forces. x0 then
+    # follows from q. _y0 is None if the output is the state.
     _x0: Array | None
     _y0: Array | None
     # _reference is None if the reference of each point is its own base pose. This pose follows from
@@ -162,7 +163,7 @@ class LinearBatch(validation.Result):
 
     @property
     def x0(self) -> Array:
-        """States at the points (N, nx); computed at each access if the points are at rest."""
+        """States at the points (N, nx); computed at each access if all points have the same A."""
         return self._states_at_rest(self.q) if self._x0 is None else self._x0
 
     @property
@@ -302,7 +303,7 @@ class LinearBatch(validation.Result):
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:
-        common = {**dict.fromkeys(_MODEL), **self._asked}  # None unless a field is known
+        common = {**dict.fromkeys(_MODEL), **self._asked}  # fields without a value are None
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()

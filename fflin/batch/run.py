@@ -53,7 +53,7 @@ Result: TypeAlias = tuple[Mapping[str, Array], list[str]]
 class Job(Protocol):
     """Computation on rows. Workers receive a pickled job, and each worker unpickles it once."""
 
-    shapes: dict[str, tuple[int, ...]]  # shape per row of each array of the result
+    shapes: dict[str, tuple[int, ...]]  # {name of a result array: shape of one row}
     threaded: bool  # whether threads of this process can compute chunks in parallel
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array], /) -> list[str]:
@@ -117,13 +117,13 @@ def run_chunks(
 ) -> None:
     """Compute the missing chunks of a store, and save the results.
 
-    The store saves the rows and results for which it has arrays. Only chunks that begin before row
-    `upto` are computed.
+    The store saves the rows and results for which it has arrays. If `upto` is given, only chunks
+    that begin before row `upto` are computed.
 
-    If the function `made` is None, the first chunk that fails ends the call with `FflinError`. If
-    `made` is given, all other chunks are still computed, and `SweepError` is raised at the end. If
-    the store is in memory, `made` is called with the rows and results of the other chunks, and
-    returns the attribute `batch` of this error.
+    If `made` is None, the first chunk that fails ends the call with `FflinError`. If `made` is
+    given, the other chunks are still computed, and `SweepError` is raised at the end. For a store
+    in memory, the attribute `batch` of this error is the result of ``made(arrays)``, where `arrays`
+    contains the rows and results of the other chunks. If all chunks fail, `batch` is None.
     """
     left, done = list[Span](), 0
     for start in range(0, store.count, store.chunk):
@@ -187,16 +187,18 @@ def _results(
                 span = waiting.popleft()
                 try:
                     running[submit(*span)] = span
-                except Exception as error:  # broken, shut down, or specific to the executor
+                except Exception as error:
+                    # The pool is broken or shut down, or the executor raises its own exception
+                    # type.
                     yield span, _reason(error)
-            ready = list(running)[:1]  # wait for the chunks of this process in order
+            ready = list(running)[:1]  # threads: wait for the chunk that was submitted first
             if not inside:
                 ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
             for future in ready:
                 span = running.pop(future)
                 try:
                     result = future.result()
-                except Exception as error:  # each executor raises its own types
+                except Exception as error:  # each executor raises its own exception types
                     if inside:
                         raise
                     result = _reason(error)
@@ -227,7 +229,8 @@ def work(pickled: bytes, rows: Rows, start: int, stop: int) -> Result:
 @lru_cache(maxsize=4)
 def _unpickled(job: bytes) -> Job:
     """Unpickle a job. The cache keeps the job, so that a worker prepares each job only once."""
-    with _TURN, warnings.catch_warnings():  # one thread at a time, because threads share filters
+    # Only one thread at a time may change the warning filters, because all threads share them.
+    with _TURN, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the caller has received these warnings
         result: Job = pickle.loads(job)
     return result
@@ -292,9 +295,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, even in the middle of a task."""
-        # Do not join the threads, because a join could block forever: if Ctrl-C interrupts a wait
-        # for a future, the future can stay locked, and the thread that sets its result never ends.
-        # All other threads end when their processes end.
+        # Do not join the threads, because a join could block forever. If Ctrl-C interrupts a wait
+        # for a future, the future can stay locked. The thread that sets the result of this future
+        # then never ends. All other threads end when their processes end.
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         with self._lock:
             self._ended = "the workers have been shut down"
@@ -350,11 +353,11 @@ _TURN = Lock()
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Return a context in which new processes ignore Ctrl-C and modules in the working folder.
+    """Return a context in which new processes start isolated (``python -I``), with Ctrl-C blocked.
 
-    By default, a process that multiprocessing starts looks for modules in the working folder first,
-    until it has copied `sys.path` from its parent process. Worker processes can ignore Ctrl-C,
-    because the parent process also receives it and then ends its workers.
+    Without ``-I``, a new process of multiprocessing searches the working folder for modules first,
+    until it copies `sys.path` from its parent process. Worker processes may ignore Ctrl-C, because
+    Ctrl-C also reaches the parent process, which then ends its workers.
     """
     from multiprocessing import resource_tracker, util
 
@@ -362,7 +365,7 @@ def _starting() -> Iterator[None]:
     with _TURN:
         usual = names[key]
         names[key] = lambda: ["-I", *usual()]
-        masked = getattr(signal, "pthread_sigmask", None)  # not on Windows
+        masked = getattr(signal, "pthread_sigmask", None)  # None on Windows
         if masked:
             # Start the resource tracker first, because its start unblocks SIGINT.
             resource_tracker.ensure_running()

@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.kernel.derivatives import Mask, RowAccelerations
 
-# Limits of the size of a chunk: bytes of its result, and number of its rows. A chunk must take much
-# longer to compute than to send, and several chunks must fit into memory.
+# Limits of the default chunk size: bytes (configurations plus results), and number of rows. A chunk
+# must take much longer to compute than to send, and several chunks must fit into memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
-# Warning filters belong to the whole process, so only one thread at a time changes them.
+# Only one thread at a time may change the warning filters, because all threads share them.
 _TURN = Lock()
 
 # Attributes that identify a robot, in addition to its Pinocchio model.
@@ -152,7 +152,7 @@ def sweep(
     task = SweepTask(job, q, v, u)
     count, size, row = task.count, chunk, job.row_bytes
     if size is None:
-        # The chunk size is chosen such that all threads or workers compute equally many chunks.
+        # Choose the chunk size such that all threads or workers compute about equally many chunks.
         same = how.count(job)
         size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
         size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
@@ -193,11 +193,11 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
 
 
 class ChunkJob:
-    """Job that linearises chunks of points with `Linearizer`.
+    """Job that linearises chunks of points with the compiled kernel or with `Linearizer`.
 
-    The rows of a chunk contain the configurations q. They also contain v if velocities are given,
-    and u0 if inputs are given. If neither velocities nor inputs are given, the caller sets
-    `at_rest`.
+    `Linearizer` also linearises the points that the kernel skips. The rows of a chunk contain the
+    configurations q. They also contain v if velocities are given, and u0 if inputs are given.
+    `at_rest` must be false if velocities or inputs are given.
     """
 
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
@@ -309,8 +309,9 @@ class SweepTask:
     ) -> None:
         self.job, self.robot = job, (robot := job.linearizer.robot)
         prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
-        # `_points` generates configurations on demand. `_known` contains the given arrays. A single
-        # v or u for all points is broadcast to one row per point.
+        # `_points` generates configurations on demand; it is None if q is an array. `_known`
+        # contains the given arrays. A single v or u for all points is broadcast to one row per
+        # point.
         points = checked_points(robot, q)
         self._points = None if isinstance(points, np.ndarray) else points
         self._known = {"q": points} if isinstance(points, np.ndarray) else {}

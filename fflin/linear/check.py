@@ -48,30 +48,32 @@ _ULPS = 8.0
 # Assumed rounding error [ulp] of a finite difference of accelerations.
 _STEP_ULPS = 64.0
 
-# The relative tolerance for the comparison with ABA derivatives is the larger of two values:
-# _ROUTE_TOLERANCE, and _ROUTE_ROUNDING times the condition number of M.
+# The relative tolerance for the comparison with ABA derivatives is the largest of three values:
+# _ROUTE_TOLERANCE, _ROUTE_ROUNDING times the condition number of M, and _ROUTE_SAFETY times the
+# residual M M^-1 - I of ABA's M^-1. M is scaled to a unit diagonal.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
-# The same two numbers for the comparison with finite differences. Both are larger, because the
-# division by a small step amplifies rounding errors.
+# The comparison with finite differences has a tolerance of the first two kinds. Both values are
+# larger, because the division by a small step amplifies rounding errors.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
 # Largest expected ratio of the error of ABA's derivatives to the residual M M^-1 - I of ABA's M^-1.
 _ROUTE_SAFETY = 10.0
 
-# Upper bound of all tolerances, even for an ill-conditioned M. A larger tolerance would confirm
-# fewer than two digits.
+# Upper bound of all default tolerances, even for an ill-conditioned M. A larger tolerance would
+# confirm fewer than two digits.
 _LOOSEST = 1e-2
 
-# The terms with the base's linear velocity cancel in exact arithmetic. Numerically, rounding errors
-# of about 1e-16 of the terms remain. So the scale by which the errors of A are divided includes
-# _ROUNDING_FRACTION times the terms. _ROUNDING_FRACTION times the tolerance 1e-9 is far above
-# 1e-16. A larger _ROUNDING_FRACTION would hide other errors.
+# In ABA's derivatives, the terms with the base's linear velocity cancel in exact arithmetic.
+# Numerically, rounding errors of about 1e-16 of the terms remain. So the scale by which the errors
+# of A are divided includes _ROUNDING_FRACTION times the terms. _ROUNDING_FRACTION times the
+# tolerance 1e-9 is far above 1e-16. A larger _ROUNDING_FRACTION would hide other errors.
 _ROUNDING_FRACTION = 1e-3
 
 
-# If the base is faster than _FAST [m/s], velocities are measured relative to an observer. The
+# If the base is faster than _FAST [m/s], ABA receives velocities relative to an observer. The
 # observer moves with the velocity that the base has at the operating point. Without the observer,
-# rounding errors of the base velocity would hide the other velocities.
+# rounding errors of the base velocity would hide the other velocities. There is no observer in
+# orbit.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. The error of the
@@ -226,7 +228,7 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[tuple[str, dict[str
 
     model, nx, nv, g = Nonlinear(aba, lin), state.nx, len(M), state.groups
     point = np.concatenate((lin.x0, lin.u0))
-    # The steps of the finite differences must be small. If light links are aligned, even a small
+    # The steps of the joint positions must be small. If light links are aligned, even a small
     # rotation of a joint strongly changes the accelerations.
     steps = np.full(nx + len(lin.u0), 2e-4)
     # Keep the points of the differences well inside the chart, because f is steep near the limit
@@ -273,7 +275,7 @@ def _output_errors(
     """Return the errors of y0, C and D.
 
     y0 is compared with the outputs of the nonlinear model. C and D are compared with finite
-    differences of the outputs.
+    differences of the outputs. If the output is the state, the errors are y0 - x0, C - I and D.
     """
     state, nx = model.state, len(lin.x0)
     if state.robot.outputs == (FullState(),):
@@ -351,12 +353,15 @@ def _in_frame(state: StateMap, q: Array, matrix: Array) -> Array:
 def aba_route(
     aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return A and B from ABA's derivatives by (4.9), (15.3) and (15.4), and also ABA's M^-1."""
+    """Return A and B from ABA's derivatives, see (4.9), (15.3), (15.4); also return ABA's M^-1.
+
+    `u` is in the axes of the frame. M^-1 (6 + n, 6 + n) is in base axes.
+    """
     state = aba.state
     own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
-    # So place the base at the world's origin. This is allowed, because no derivative depends on the
+    # So place the base at the world's origin. This is allowed, because A and B do not depend on the
     # position of the base, even in orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
@@ -377,8 +382,8 @@ def aba_route(
 class Scales:
     """Magnitudes of the terms of a model, by which the errors of A and B are divided.
 
-    The arguments M (6 + n, 6 + n) and B (nx, nu) come from an independent computation, not from
-    the model.
+    The arguments are the inertia M (6 + n, 6 + n) and B (nx, nu). B must come from an independent
+    computation, not from the model.
     """
 
     def __init__(self, aba: Aba, lin: LinearModel, M: Array, B: Array) -> None:
@@ -427,12 +432,11 @@ class Scales:
         return errors
 
     def _sizes(self, v: Array) -> tuple[Array, float]:
-        """Return magnitudes of terms that cancel: (6, 6) for the blocks of A, and one for f0.
+        """Return magnitudes of terms that may cancel: (6, 6) for the blocks of A, and one for f0.
 
-        In the row of each acceleration, the terms are divided by the mobility of the coordinate.
+        The terms are evaluated at the velocity v (nv,), in Pinocchio's order. In the row of each
+        acceleration, the terms are divided by the mobility of the coordinate.
         """
-        # The base's linear velocity is multiplied by _ROUNDING_FRACTION, because terms with the
-        # linear velocity contribute only rounding errors to Pinocchio's derivatives.
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
         for i, name in enumerate(robot.joint_names, 6):
@@ -446,6 +450,8 @@ class Scales:
         # largest mobility. The acceleration is the torque times the squared mobility. So the scaled
         # acceleration is the torque times the mobility.
         spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
+        # Multiply the base's linear velocity by _ROUNDING_FRACTION, because terms with the linear
+        # velocity contribute only rounding errors to Pinocchio's derivatives.
         slowed = speed.copy()
         slowed[LINEAR] *= _ROUNDING_FRACTION
         resting, unit = slowed / mobility, 1.0 / mobility
@@ -531,7 +537,7 @@ class Nonlinear:
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
         point = np.hstack((x, np.tile(lin.u0, (7, 1))))
         (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
-        # Differences at t = -3 h ... 3 h.
+        # Evaluate each motion at the times t = +-h, +-2 h and +-3 h.
         h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
         t, speeds = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None], np.tile(v, (6, 1))
         moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)

@@ -191,7 +191,7 @@ def equilibrium(
         sizes, named = np.abs(left), list(pushes.items())
         forces = [
             f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
-            for i in np.argsort(-sizes)  # the largest effect first
+            for i in np.argsort(-sizes)  # the largest scaled force first
             if sizes[i] > 1e-6 * sizes.max()
         ]
         raise EquilibriumError(
@@ -211,7 +211,7 @@ def equilibrium(
 class _Balance:
     """Minimum-norm inputs that balance the forces at a point, and the residual forces.
 
-    The inputs are in base axes.
+    Inputs and forces on the base are in base axes.
     """
 
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
@@ -223,8 +223,8 @@ class _Balance:
         M, acceleration = lin.M, drift[-len(lin.M) :]
         mobility = np.sqrt(np.linalg.inv(M).diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
-        # Compute bounds (6 + n,) of the rounding errors in the forces. Large terms may cancel in
-        # the forces.
+        # Compute bounds (6 + n,) of the rounding errors in the forces, because large terms may
+        # cancel in the forces.
         state, springs = linearizer.prepared.map, robot.springs
         absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
         speed = np.abs(state.velocities(absolute))
@@ -244,7 +244,8 @@ class _Balance:
 def _require_steady(lin: LinearModel, drift: Array) -> None:
     """Raise `EquilibriumError` if the motion of a joint or of the base changes the forces.
 
-    `drift` (nx,) is the state derivative. The error is raised in three cases:
+    `drift` (nx,) is the state derivative. Under gravity, it excludes rotation about the vertical.
+    The error is raised in three cases:
 
     - A joint that is not a rotor moves.
     - In orbit, the base moves relative to the orbital frame.
@@ -276,8 +277,8 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
 
 _EPS = float(np.finfo(float).eps)
 
-# Largest allowed residual, as a fraction of the forces to be balanced. Also the largest velocity of
-# the base [rad/s or m/s] that counts as zero.
+# Largest magnitude that counts as zero. It is relative for residual forces, stiffnesses and
+# thrusts, and absolute for the rates of q_b [1/s] and r_b [m/s].
 TOLERANCE = 1e-9
 
 

@@ -20,7 +20,9 @@ from fflin.linear.model import LinearModel, StateSpace
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
-_ROUNDING = 1e-12  # smaller entries, relative to the largest, count as zero
+# An entry of A or B that is exactly zero stays zero if its change, divided by the largest entry, is
+# less than this fraction.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -268,7 +270,7 @@ def from_tool(
     for name, given, expected in zip("AB", (A, B), ours, strict=True):
         change = expected if given is None else shaped(name, given, expected.shape)
         change = change - expected
-        if step:  # only the rows of rates count: the rows of positions follow from them
+        if step:  # use only the velocity rows, because the position rows follow from them
             nv = len(change) // 2
             change = np.vstack((0.0 * change[:nv], change[nv:] / step))
         changes.append(change)
@@ -283,7 +285,7 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the Jacobians of the model and of the tool, and dy/dt (15.1)."""
+    """Return a tool's coordinates, the model's and the tool's Jacobians, and dy/dt (15.1)."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
@@ -321,7 +323,8 @@ def _step(tool: str, dt: float | None) -> float:
 def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a semi-implicit Euler step of h [s] (15.6).
 
-    `rate` is dy/dt. For the base, linear rows precede angular rows.
+    A, B and `rate`, the derivative dx'/dt, are in the coordinates of MuJoCo. For the base, linear
+    rows precede angular rows.
     """
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)

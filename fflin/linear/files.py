@@ -4,9 +4,9 @@ A model in csv consists of several tables, for other programs. fflin does not re
 matrix has a table with the names of the rows and columns. The states, the inputs and the outputs
 have a table each. The table ``info`` contains all other entries.
 
-A trajectory in csv is one table. The last column contains the same digest in every row. The digest
-is computed from the other columns. A digest in a separate line would make the table unreadable for
-other programs.
+A trajectory in csv is one table. If the trajectory is ``verified``, the last column contains the
+same digest in every row. The digest is computed from the other columns. A digest in a separate line
+would make the table unreadable for other programs.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
 
 
 def given(value: T, _: object) -> T:
-    """Return an entry unchanged."""
+    """Return `value`; `partial(given, value)` replaces a function that computes it from a model."""
     return value
 
 

@@ -66,8 +66,9 @@ def require_same(
 ) -> None:
     """Raise `InputError` if the robot's signals do not have the given names and units.
 
-    `made` is the beginning of the message, such as "the model was made for 'arm'". If `units` is
-    None, only names are compared. If `part` is True, the robot may have further signals.
+    `made` is the beginning of the message, such as "the model was made for 'arm'". The text before
+    " was " must name the object. If `units` is None, only names are compared. If `part` is True,
+    the robot may have further signals.
     """
     robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
     if part and names != tuple(others):

@@ -248,8 +248,8 @@ def along(motion: Trajectory) -> LinearTrajectory:
 
 
 # _ACCURACY is the required relative accuracy of a sample's transition matrix. The integration steps
-# are halved until the matrix is accurate, or until each interval between knots has _MOST_PARTS
-# parts.
+# are halved until the matrix is accurate, or until each interval has _MOST_PARTS parts. The knots
+# within a sample divide the sample into intervals.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
@@ -260,9 +260,9 @@ class Steps(NamedTuple):
     """The m integration steps of a sample. In each step, F = [[A, B], [0, 0]] is constant."""
 
     F: Array  # (m, nx + nu, nx + nu)
-    h: Array  # (m,) [s]
-    maps: Array  # (m, nx, nx + nu)
-    nodes: Array  # (m, 2) [s] times of the nodes of F with the larger and the smaller weight
+    h: Array  # (m,) [s] lengths of the steps
+    maps: Array  # (m, nx, nx + nu) transition matrices of the steps
+    nodes: Array  # (m, 2) [s] the two Gauss points; the first has the larger weight in F
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:

@@ -237,9 +237,9 @@ class Linearizer:
             slow["placement"] = partial(own_reference, robot)
         # Default velocity and default inputs: all zero.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
-        # Whether B is the only matrix to be computed for a model at rest. This is the case for
-        # default inputs, outputs and reference, if the robot has no springs, gravity, orbit or
-        # stored momentum.
+        # Whether B of a model at rest is [0; M^-1], and all other matrices are known. Inputs,
+        # outputs and reference must be the default ones, and `moving` must be false. The robot must
+        # have no springs, dampers, gravity, orbit or stored momentum.
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
@@ -270,8 +270,8 @@ class Linearizer:
             inverse = out if actuation.default else np.empty((nv, nv))
             inertia.invert(q, inverse)
             if not actuation.default:
-                # Move the base to the origin to avoid rounding errors. The result is the same,
-                # because the input matrix B_u does not depend on the base position.
+                # Place the base in its neutral pose at the origin to avoid rounding errors. The
+                # result is the same, because B_u in base axes does not depend on the base pose.
                 np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:

@@ -170,10 +170,12 @@ class LinearModel(StateSpace):
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     drift: Array | None = None
-    # Only for a discretised model or a model from a file: the fingerprint of the model, and the
-    # source model, which has the certificate. The source of a discretised model is the
+    # Fingerprint of this model, and the source model, which has the certificate. The field is None
+    # if this model has its own certificate. The source of a discretised model is the
     # continuous-time model, because the matrix exponential loses exact zeros. The source of a model
-    # from a file is the model as read from the file.
+    # from a file is the model as read from the file. The source of a reduced model is the model
+    # before the reduction. If that model is discretised, the source of the reduced model is the
+    # reduced continuous-time model.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
@@ -184,7 +186,7 @@ class LinearModel(StateSpace):
     def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
         # The generated `__init__` of a frozen dataclass would set three dozen fields one by one,
         # which takes as long as the dynamics of a small robot. So this method sets all fields at
-        # once. `shared` contains the fields that are equal in all models of a robot.
+        # once. The arrays in `shared` must be read-only, because they are not copied.
         for name, value in fields.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 fields[name] = frozen(value.copy())

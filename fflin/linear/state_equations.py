@@ -28,9 +28,10 @@ def assemble(
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
-    On entry, the upper half of A must be [0, N], as at rest (2.1). The lower halves of A and B are
-    the arrays `rates.slopes` and `rates.by_u`. On entry, both arrays contain derivatives in base
-    axes. The function converts both arrays in place to the chart and the frame.
+    On entry, the upper half of A must be [0, N], as at rest (2.1). `rates.slopes` must be a view of
+    the lower half of A. `rates.by_u` is the lower half of B. On entry, both arrays must contain
+    derivatives in base axes. The function converts both in place to the chart and the frame. `nu`
+    and `u` are in base axes.
     """
     state = actuation.state
     g, nv, lower = state.groups, state.nx // 2, rates.slopes
@@ -69,7 +70,7 @@ def assemble(
         chart.turn_rows(actuation.held, rates.by_u.mT)
     if state.falls:
         f0[..., g.v_b] += rates.gravity
-    if state.orbit:  # (14.6)
+    if state.orbit:  # (14.2), (14.5), (14.6)
         turn, pull = state.orbit
         spin = chart.R.mT @ turn
         A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)

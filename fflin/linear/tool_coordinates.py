@@ -25,14 +25,16 @@ _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # all others have rad or rad/s
 class Convention(NamedTuple):
     """Convention of a tool for the coordinates of a free-flyer."""
 
-    # Attitude in x': "wxyz" (a quaternion), "q_b", "euler", "tangent" (a rotation vector), or
-    # "pose" (one tangent vector for attitude and position).
+    # Attitude in the tool's state x': "wxyz" (a quaternion), "q_b", "euler", "tangent" (a rotation
+    # vector), or "pose" (one tangent vector for attitude and position).
     attitude: str
-    stored: str  # attitude in q
+    stored: str  # attitude in the tool's q: "wxyz", "xyzw", "matrix" or "euler"
     angular_first: bool
-    axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), are in world axes
-    at_centre: bool = False  # base frame at the root link's centre of mass, in its inertia's axes
-    rates: bool = False  # angle rates in place of omega
+    # First flag: whether omega and the base torque are in world axes. Second flag: whether v and
+    # the base force are in world axes.
+    axes: tuple[bool, bool]
+    at_centre: bool = False  # whether the base frame is the root link's inertial frame (`_centre`)
+    rates: bool = False  # whether the twist contains the rates of the Euler angles, not omega
 
 
 TOOLS = {
@@ -56,7 +58,7 @@ class Jacobians(NamedTuple):
     left: Array  # left inverse of P
     V: Array  # du/du'
     H: Array  # du/dy for constant u' (15.4)
-    extra: Array  # derivative of dx'/dt along the length of a quaternion, which y lacks (15.5)
+    extra: Array  # term dn/dt n^T of (15.5) for the length of a quaternion; zero without quaternion
 
 
 class ToolCoordinates:
@@ -67,10 +69,11 @@ class ToolCoordinates:
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
         self.tangent = kind.attitude in ("tangent", "pose")
-        self._roll = 0 if kind.angular_first else 3  # from (angular, linear) to the tool's order
+        # Shift for `np.roll` from the order (angular, linear) to the order of the tool.
+        self._roll = 0 if kind.angular_first else 3
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
-        swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular)
+        swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular) to (angular, linear)
         # X converts from the frame of the root link to the base frame of the tool. A displacement y
         # of the base becomes X y, a twist nu becomes X nu, and a wrench w becomes X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
@@ -85,7 +88,8 @@ class ToolCoordinates:
         if tool and kind.stored == "xyzw":
             self._scales[:] = 1.0
         self.actuation = acting = Actuation(state)
-        self._wrench = wrench = acting.fixed[:6]  # wrench on the base per unit of each input
+        # Wrenches (6, nu) of unit inputs. Only the columns of base torques and forces are nonzero.
+        self._wrench = wrench = acting.fixed[:6]
         if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
                 "in spart, a base force acts at the centre of mass of the root link, so a "
@@ -118,7 +122,7 @@ class ToolCoordinates:
             return q, v
         attitude, R = self._attitude(q)
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
-        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
+        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # R by columns
         pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
         turned = self._rotated(R, rates=self.convention.rates)
         twist = turned @ self._X @ self.state.velocities(v)[:6]
@@ -193,9 +197,10 @@ class ToolCoordinates:
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
-        """Return the `Jacobians` at a point, given by Pinocchio's q, and nu and u in base axes.
+        """Return the `Jacobians` at a point.
 
-        `rates` (6 + n,) is d(nu)/dt.
+        `q` is in Pinocchio's order. `nu`, `u` and `rates` are in base axes. `rates` (6 + n,) is the
+        time derivative of `nu`.
         """
         n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
         here, R_now = self._attitude(q)
@@ -255,7 +260,12 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
 
 
 def _centre(robot: Robot) -> pin.SE3:
-    """Return the placement of the root link's inertial frame: centre of mass, axes of inertia."""
+    """Return the placement of the root link's inertial frame relative to the root link.
+
+    The frame has its origin at the centre of mass, and the axes of the inertia in the URDF. If the
+    link is not in `Robot.pieces`, the origin is the centre of mass of the whole base body, and the
+    axes are the axes of the root link.
+    """
     frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
     name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
     if piece := robot.pieces.get(name):
@@ -264,9 +274,9 @@ def _centre(robot: Robot) -> pin.SE3:
 
 
 def _joint_path(robot: Robot, name: str) -> list[int]:
-    """Return the index in the URDF of each joint on the path from the root to a joint.
+    """Return the URDF indices of the frames on the path from the root to a joint, for sorting.
 
-    A joint that is not in the URDF gets an index after the last joint of the URDF.
+    A frame that is not a joint of the URDF, such as a link, gets an index after the last joint.
     """
     frames, path, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)

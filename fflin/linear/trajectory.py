@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 # Largest residual at which the knots are accepted as a motion of the robot.
 _MOTION = 1e-2
 
-# Largest rotation [rad] of the base between adjacent knots. For a rotation near pi, the knots do
-# not define the direction of rotation.
+# Largest allowed rotation [rad] of the base between adjacent knots. For a rotation near pi, the
+# knots do not define the direction of rotation.
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
@@ -41,15 +41,15 @@ _CAUSES = (
     "or springs, damping or gravity that differ from the robot"
 )
 
-# The integration over an interval is repeated with halved steps, until the state at the end of the
-# interval changes by at most _ACCURACY, or until the interval has _MOST_STEPS steps. The change of
-# the state is relative: it is divided by the duration of the interval and by the largest velocities
-# and accelerations of the motion.
+# The integration over an interval is repeated with halved steps. The repetition ends if the state
+# at the end of the interval changes by at most _ACCURACY, or if the interval has _MOST_STEPS steps.
+# The change of the state is relative: it is divided by the duration of the interval and by the
+# largest velocities and accelerations of the motion.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
-# Rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest position.
-# An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to the sum of
-# the magnitudes of the terms.
+# Assumed rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest
+# position. An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to
+# the sum of the magnitudes of the terms.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
@@ -116,7 +116,7 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
-    _note: str = field(default="", kw_only=True)  # note printed below; not saved in files
+    _note: str = field(default="", kw_only=True)  # last lines of the report; not saved in files
 
     def __post_init__(self) -> None:
         robot = instance("robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one")
