@@ -35,7 +35,7 @@ _COMPARED = re.compile(
 )
 _COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 _DEGREE = math.pi / 180.0
-_FACTORS = {  # from the unit of a condition to the unit of a figure
+_FACTORS = {  # {(unit in a condition, unit of the figure): conversion factor}
     ("deg", "rad"): _DEGREE,
     ("rad", "deg"): 1.0 / _DEGREE,
     ("deg/s", "rad/s"): _DEGREE,
@@ -90,8 +90,8 @@ class Campaign(FrozenArrays):
     - ``worst NAME``: largest magnitude during the run: of the error if NAME is a kind or a state,
       of the command if NAME is an input.
     - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
-      largest value. ``settle`` [s]: the longest settling time of the kinds that the policy
-      controls.
+      largest value. ``settle`` [s]: the longest settling time of attitude, position and joints, as
+      far as the policy controls them.
     - ``end`` [s]: end of the run.
     - ``drawn NAME``: value drawn for the dispersed parameter NAME.
 
@@ -158,9 +158,9 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    input_limits: tuple[float, ...]  # largest input magnitudes; infinite without a limit
+    input_limits: tuple[float, ...]  # largest permitted magnitudes; infinite without a limit
     times: tuple[float, ...]
-    judged: tuple[str, ...]  # kinds of errors that the policy controls
+    judged: tuple[str, ...]  # subset of attitude, position, joints that the policy controls
     robot: str
     urdf_sha256: str
     duration: float
@@ -193,7 +193,7 @@ class Campaign(FrozenArrays):
 
         The default is the figure that the goals first compare by ``<`` or ``<=``. If no goal
         contains such a comparison, the default is ``worst KIND``, where KIND is the first of
-        ``attitude``, ``position``, ``joints``, ... that the policy controls.
+        ``attitude``, ``position`` and ``joints`` that the policy controls.
         """
         bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]

@@ -1,4 +1,4 @@
-"""Dispersions: named random values that determine the robot and initial state of each run."""
+"""Dispersions: random changes of the robot, sensors, delay and initial state of each run."""
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +34,7 @@ from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
 from fflin.simulation.run import Plant
 
-_BLOCK = 1024  # runs drawn together, independent of the chunks
+_BLOCK = 1024  # number of runs whose values are drawn together; does not depend on the chunks
 # Names of the axes, for the kinds of dispersions that have one value per axis.
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
@@ -47,14 +47,14 @@ class Column(NamedTuple):
     """Random variable with one value per run, and the quantities that this value changes."""
 
     name: str
-    kind: str  # "state", "delay", "seed" (of noise), or the last part of a name
-    at: list[int]  # indices of the states, bodies, joints, ...
+    kind: str  # "state", "delay", "seed" (of noise), or the last part of a name, such as "mass"
+    at: list[int]  # indices of the changed quantities in `Dispersions._known[kind]`
     axis: int
     inverse: Inverse
 
 
 class Dispersions:
-    """Dispersions of `monte_carlo`; they draw the robot, policy and initial state of each run."""
+    """Dispersions of `monte_carlo`: random changes of the plant, policy and initial state."""
 
     def __init__(
         self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
@@ -127,9 +127,9 @@ class Dispersions:
     def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
         """Add the columns of one kind of dispersion.
 
-        `spreads` is {name or pattern: (inverse distribution function, common name)}. If the common
-        name is not empty, all quantities that match the pattern share one random variable, which
-        has this name. `kinds` is the list of kinds in error messages.
+        `spreads` is {name, group or pattern: (inverse distribution function, common name)}. If the
+        common name is not empty, all quantities that match the key share the column with this name,
+        or one such column for each axis. `kinds` is the text that lists all kinds in messages.
         """
         robot, names = self._plant.robot, self._known[kind]
         if kind in _OF_SENSORS and not names:
@@ -180,11 +180,12 @@ class Dispersions:
         """Return {link or body: spread}, and {link or body: its key in `spreads`}.
 
         The second mapping omits keys with wildcards. A key without a wildcard overrides patterns
-        that match the same link or body.
+        that match the same link or body. If the key names a body of several links, it also
+        overrides patterns that match these links.
         """
         robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
         alone, whole = {*robot.pieces, *robot.link_of}, set[int]()
-        for key in sorted(spreads, key=alone.__contains__):  # names override patterns
+        for key in sorted(spreads, key=alone.__contains__):  # names come last to override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
@@ -222,13 +223,13 @@ class Dispersions:
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
         # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-        if isinstance(column.inverse, partial):  # a fast function of `spreads`
+        if isinstance(column.inverse, partial):  # a fast function from the module `spreads`
             return column.inverse(uniform)
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
             try:
                 kept = np.asarray(column.inverse(uniform[:count]), dtype=float)
-            except Exception as error:  # each distribution raises its own types
+            except Exception as error:  # a distribution may raise any exception
                 raise InputError(
                     f"no values can be drawn from the distribution of '{column.name}': "
                     f"{reason(error)}"
@@ -264,9 +265,10 @@ class Dispersions:
                 raise InputError(f"{said}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
-        """Return the drawn values of a kind of dispersion, (N, size) or (N, size, axes).
+        """Return the values (N, size) or (N, size, axes) of all quantities of a kind of dispersion.
 
-        Quantities that are not dispersed have the value `rest`.
+        `drawn` (N, k) contains the drawn values. `size` is the number of quantities of this
+        kind. Quantities that are not dispersed have the value `rest`.
         """
         axes = len(_AXES.get(kind, " "))
         found = np.full((len(drawn), len(self._known[kind]), axes), rest)
@@ -282,7 +284,8 @@ class Dispersions:
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return {joint: (masses (N,), centres of mass (N, 3), inertias (N, 3, 3))} of bodies.
 
-        Only dispersed bodies are included. The inertias are about the centres of mass.
+        Only dispersed bodies are included. Each key is the index of a joint in `_model`. The
+        inertias are about the centres of mass.
         """
         robot, model = self._plant.robot, self._model
         pieces, dispersed = [*robot.pieces.values()], set[int]()
@@ -290,7 +293,7 @@ class Dispersions:
         for column in self.columns:
             if column.kind in _OF_BODIES:
                 dispersed.update(column.at)
-        changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4)
+        changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4); at first, only their changes
         for at in sorted(dispersed):
             joint = pieces[at].joint
             own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
@@ -303,11 +306,11 @@ class Dispersions:
     def _springs(self, drawn: Array) -> dict[str, Array]:
         """Return {"stiffness" or "damping": values (N, n) of all joints}.
 
-        A property that is not dispersed is omitted.
+        A property that no dispersion changes is omitted.
         """
         found = dict[str, Array]()
-        # A mode has the stiffness w^2 and the damping 2 zeta w. If its frequency w changes, its
-        # damping ratio zeta remains the same.
+        # The stiffness of a mode is proportional to w^2, and its damping to zeta w. Here w is the
+        # frequency. The damping ratio zeta does not change with w.
         frequency = 1.0 + self._of("frequency", drawn)
         for kind, power in zip(_OF_SPRINGS, (2, 1), strict=True):
             if self._kinds & {kind, "frequency"}:
@@ -389,7 +392,7 @@ class Dispersions:
             policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
-            if isinstance(policy, Allocation):  # it allocates to the nominal directions
+            if isinstance(policy, Allocation):  # the allocation must use the nominal directions
                 nominal = bound(policy, plant.robot)
                 policy = _Bound(lambda _: nominal)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
@@ -399,16 +402,17 @@ class Dispersions:
 
 
 class _Bound(NamedTuple):
-    """Policy with a given function as its method `bind`; `lin` is the model of its design."""
+    """Policy whose method `bind` is a given function; `lin` is the policy's model, or None."""
 
     bind: Callable[[Robot], Policy]
     lin: LinearModel | None = None
 
 
 def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
-    """Return a copy of a policy that reads its states or outputs (ny,) with a bias and white noise.
+    """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.
 
-    `deviation` (ny,) contains the standard deviations of the noise.
+    The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
+    contains the standard deviations of the noise. `seed` (1,) is the seed of the noise.
     """
     if isinstance(policy, Allocation):
         return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
@@ -437,7 +441,7 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
 
     The columns of `axes` (3, 3) are the directions of these axes. The parameters are the mass m,
     the first moment m c with the centre of mass c, and six entries (xx xy xz yy yz zz) of the
-    inertia about the origin.
+    inertia about the origin. The argument `inertia` (N, 3, 3) is about the centre of mass.
     """
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes

@@ -30,7 +30,7 @@ from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
 _MOST = 1_000_000
-_ROUNDING = 1e-12  # eigenvalues of P up to this fraction of the largest count as zero
+_ROUNDING = 1e-12  # eigenvalues of the scaled P up to this fraction of the largest count as zero
 
 # The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
 # root of the level at most _HALVINGS times.
@@ -43,9 +43,10 @@ _LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
 def ellipsoid_axes(P: Array) -> Array:
     """Return W (nx, nx) such that W W' is a generalised inverse of P.
 
-    P is first scaled to S P S, which has a unit diagonal, because the states have different units.
-    Then W = S R, where R is the symmetric square root of the pseudoinverse of S P S. This root is
-    unique. Eigenvectors are not unique, so errors drawn along them would depend on rounding.
+    Because the states have different units, P is first scaled to S P S by a diagonal matrix S. The
+    diagonal of S P S contains ones, and zeros where the diagonal of P is zero. Then W = S R, where
+    R is the symmetric square root of the pseudoinverse of S P S. This root is unique. Eigenvectors
+    are not unique, so errors drawn along them would depend on rounding.
     """
     scale = np.sqrt(P.diagonal().clip(min=0.0))
     unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -388,8 +389,8 @@ def _outcomes(
 ) -> dict[str, Array]:
     """Return {"outcome": codes (N,)} of runs; `Funnel` lists the codes.
 
-    `final` is {kind: largest final error}, and `within` is {kind: largest error at any time}. The
-    kind "level" is e' P e, where e (nx,) is the final state error.
+    `final` is {kind: bound on the final error}, and `within` is {kind: bound on the error at any
+    time}. The kind "level" is e' P e, where e (nx,) is the final state error.
     """
     e = runs["state_errors"][:, -1]
     largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
@@ -408,8 +409,9 @@ def _tested(
 
     The level of an initial error e is e' P e. The runs start at levels between zero and the largest
     level. The largest level is the smallest trial level at which at least one of 16 trial runs
-    fails. If no trial run fails, it is the level whose ellipsoid reaches a bound of the initial
-    errors.
+    fails. If no trial run fails, or if even the run without an initial error fails, the largest
+    level is the level whose ellipsoid reaches a bound of the initial errors (_LARGEST_ATTITUDE,
+    _LARGEST_ANGLE or _LARGEST_LENGTH).
     """
     W, joints = ellipsoid_axes(P), job.plant.robot.joints
 
@@ -429,7 +431,7 @@ def _tested(
         *np.linalg.norm(W[6 : 6 + len(joints)], axis=1) / np.array(largest),
     ]
     # `root` is the square root of a level. `widest` is the square root of the level whose ellipsoid
-    # reaches one of the largest initial errors.
+    # reaches a bound of the initial errors.
     root = widest = float(1.0 / max(reach))
     # If even the run without an initial error fails, the search is skipped.
     if not simulate(np.zeros(1)).any():

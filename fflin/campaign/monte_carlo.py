@@ -27,9 +27,9 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
-# With `until`, the confidence interval is first computed after _STAGE runs, and again each time the
-# number of runs has grown by the factor _GROWTH. _STAGE is a multiple of the chunk size, so that
-# the chunk size does not affect the number of runs.
+# With `until`, the confidence interval is first computed after _STAGE runs. Before it is computed
+# again, the number of runs is multiplied by _GROWTH and rounded up to a multiple of _STAGE. The
+# chunk size must divide _STAGE, so that the number of runs does not depend on the chunk size.
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {each.name for each in fields(SimulationOptions)} - {
@@ -129,8 +129,9 @@ def monte_carlo(
         `plot_campaign` show the success rate of each goal with its confidence interval.
     until : str, optional
         Condition for ending the campaign early. The campaign ends when the confidence interval of
-        the condition's success rate is at most `width` wide. The interval is checked after 256
-        runs, and again whenever the number of runs has grown by a quarter.
+        the condition's success rate is at most `width` wide. The interval is first checked after
+        256 runs. Before each further check, the number of runs grows by a quarter, rounded up to a
+        multiple of 256.
     width, confidence : float
         Width and confidence level of the interval for `until`. The report uses the same
         confidence level.
@@ -246,7 +247,7 @@ def monte_carlo(
 
 
 def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
-    """Return the number of runs per chunk."""
+    """Return the number of runs per chunk; if `staged` is true, it must divide _STAGE."""
     if given is None:
         return chunk_size(min(_STAGE, runs) if staged else runs, workers)
     size = -(-given // LANES) * LANES
@@ -260,7 +261,7 @@ def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
 def _require_sendable(job: CampaignJob) -> None:
     try:
         pickle.dumps(job)
-    except Exception as error:  # each object raises its own types
+    except Exception as error:  # pickling may raise any exception
         raise InputError(
             f"robot, policy or spreads cannot be sent to workers ({error}); define their classes "
             "and functions at the top level of a module, or leave workers and executor out"
@@ -283,9 +284,9 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
 
 
 def _earlier(path: Path, request: str) -> Campaign | None:
-    """Return the campaign that an earlier identical call wrote, or None if there is no file.
+    """Return the campaign that a call with the same `request` wrote, or None if there is no file.
 
-    Raise `FileError` if a different call wrote the file.
+    Raise `FileError` if a different call wrote the file, or if the file cannot be read.
     """
     if not path.is_file():
         return None
@@ -326,7 +327,11 @@ def _header(job: CampaignJob) -> dict[str, object]:
 
 
 def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
-    """Return a digest of the data that determine the result: the call and its drawn values."""
+    """Return a digest that identifies the runs of a call.
+
+    The digest covers the robot, the policy, the options, the first drawn values, and the versions
+    of fflin and Pinocchio. The goals and the confidence level are excluded.
+    """
     drawn = job.dispersions.drawn(0, min(runs, _STAGE))
     kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
     call = repr((kept, __version__, pin.__version__))

@@ -117,8 +117,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     percent = 100.0
     with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
-        # The figure shows the error divided by the displacement. Therefore its exponent is one less
-        # than the exponent `slope` of the absolute error.
+        # The plotted error is divided by the displacement. Therefore the exponent of the plotted
+        # error is one less than `slope`, the exponent of the absolute error.
         order = "relative error"
         if np.isfinite(validity.slope):
             order += f", ~ displacement^{validity.slope - 1.0:.2f}"
@@ -207,9 +207,10 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
 def _bands(
     axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
 ) -> None:
-    """Draw values (N, M) over time: one line for each of `runs`, and bands of the runs in `of`."""
-    # Infinite values of stopped runs are drawn at the upper edge of the axes. The quantiles are not
-    # interpolated between runs, because a mean of a finite value and the edge has no meaning.
+    """Draw values (N, M) over time: lines of `runs`, and bands and median of the runs in `of`."""
+    # The bands and the median show infinite values of stopped runs at the upper edge of the axes.
+    # The quantiles are not interpolated between runs, because a mean of a finite value and the edge
+    # has no meaning.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
     shown, t = np.minimum(values[of], most), campaign.times
     for tail, name, dark in _BANDS:
@@ -228,7 +229,7 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
     _bands(axes, campaign, history, runs)
     ends = np.quantile(history, 0.05, axis=0, method="inverted_cdf")
     most, least = axes.get_ylim()[1], float(ends[ends > 0.0].min(initial=np.inf))
-    if least < 0.05 * most:  # so that small final values are visible
+    if least < 0.05 * most:  # logarithmic, so that small final values are visible
         axes.set(yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most))
     _goals(axes.axhline, campaign, kind)
     axes.set(title=f"{kind} error", ylabel=f"[{KINDS[kind]}]")
@@ -269,7 +270,7 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
 def _inputs(
     axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
 ) -> None:
-    """Draw the largest magnitude in a group of inputs over time, and the limit of the group.
+    """Draw the largest magnitude in a group of inputs over time, and the group's smallest limit.
 
     The bands include only the completed runs. The limit is omitted if it is far above the inputs.
     """
@@ -285,7 +286,7 @@ def _inputs(
 
 
 def _correlations(axes: Axes, campaign: Campaign) -> None:
-    """Draw the rank correlations of the drawn values with the figure `Campaign.about`.
+    """Draw the largest rank correlations of drawn values with the figure `Campaign.about`.
 
     A grey area marks correlations that are not significant.
     """

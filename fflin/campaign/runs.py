@@ -106,10 +106,11 @@ def kinds_of(state: StateMap) -> Indices:
 class CampaignJob:
     """Job that simulates runs of one plan, each with its own drawn values; see `batch.run.Job`.
 
-    If `given` is None, the drawn values are the deviations (nx,) of the initial state. The function
-    `judge` computes the arrays of the result from the outcomes. A run ends early if it satisfies
-    the condition `over`. This condition is possible only with histories, because the initial errors
-    are read from the first entry of the histories.
+    `given` are the dispersions of `monte_carlo`. If `given` is None, the drawn values are the
+    deviations (nx,) of the initial state. The function `judge` computes the arrays of the result
+    from the outcomes. A run ends early if it satisfies the condition `over`. If `over` is given,
+    the target must be fixed. `options` must then contain histories, because the initial errors are
+    read from the first entry of the histories.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class CampaignJob:
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from `target`: a fixed state (nx,) or the states (steps + 1, nx) of
-        # a reference motion. `path` contains q and nu of this motion.
+        # a reference motion. `path` contains q and nu of the reference motion, or is empty.
         self.target, self.path = self.x0 if self.plan.target is None else self.plan.target, []
         if reference := self.plan.reference:
             t = times.dt * np.arange(times.steps + 1)
@@ -155,14 +156,14 @@ class CampaignJob:
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
-        # `outcome_shapes` contains the shape of each array of an outcome, and `shapes` the shape,
-        # per run, of each array that `judge` returns. They are read from the outcome of a run of
-        # zero steps.
+        # `outcome_shapes` contains the shape of each array of an outcome. `shapes` contains the
+        # shape per run of each array that `judge` returns. Both are read from the outcome of a run
+        # of zero steps.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
         none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
         outcome = self.outcome(none)
         self.outcome_shapes = {key: x.shape for key, x in outcome.items()}
-        with np.errstate(invalid="ignore"):  # this outcome has no initial error
+        with np.errstate(invalid="ignore"):  # `judge` may divide by an initial error of 0
             results = judge({key: x[None] for key, x in outcome.items()})
         self.shapes = {key: x.shape[1:] for key, x in results.items()}
 
@@ -233,8 +234,8 @@ class CampaignJob:
     def outcome(self, run: Recording) -> dict[str, Array]:
         """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.
 
-        The outcome also contains `state_errors`, the history of the state errors. Its entries are
-        NaN after the run was stopped.
+        Every step must be recorded. The outcome also contains `state_errors`, the history of the
+        state errors. Its entries are NaN after the run was stopped.
         """
         count, steps, dt = len(run.q), self.steps, self.plan.times.dt
         target = self.target[:count] if self.target.ndim == 2 else self.target
@@ -296,7 +297,7 @@ class CampaignJob:
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
         short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
-        for each in (1, short, long):  # the first run compiles the loop if needed
+        for each in (1, short, long):  # the run of one step compiles the loop if needed
             few.plan = plan.replace(times=plan.times._replace(steps=each))
             # Other programs can slow down a trial, so the fastest of three trials counts.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
@@ -359,7 +360,7 @@ class RunStatistics(lanes.Statistics):
             values[:] = initial
 
     def over(self, q: Array, v: Array) -> Mask:
-        """Return the mask (LANES,) of runs to end at q and v (LANES, ..); see `CampaignJob`."""
+        """Return a mask (LANES,) of the runs that `CampaignJob.over` ends, judged by q and v."""
         over, first = self._job.over, _by_run(self._marks.states[: self._state.nx])
         return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
 
@@ -435,7 +436,7 @@ def expect(
 
 
 def chunk_size(count: int, workers: int, least: int = LANES) -> int:
-    """Return a number of runs per chunk such that each worker computes several chunks."""
+    """Return a chunk size, at least `least`; if possible, each worker computes several chunks."""
     size = _LARGEST_CHUNK
     while size > least and 4 * workers * size > count:
         size //= 2

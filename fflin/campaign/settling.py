@@ -1,8 +1,8 @@
 """Settling of a regulated robot from random displacements, measured with an error norm.
 
 The norm of a deviation z is sqrt(z' P z), where z' P z is a Lyapunov function of the linear loop.
-Along the linear loop, this function decreases at the rate z' Q z. Q is diagonal, and z' Q z has the
-unit of energy.
+In a continuous loop, z' Q z is the rate at which z' P z decreases. In a sampled loop, z' Q z is the
+decrease of z' P z from one sample to the next. Q is diagonal, and z' Q z has the unit of energy.
 """
 
 import math
@@ -31,11 +31,12 @@ SETTLED, DIVERGED = 1e-3, 1e3
 # _CONSTANTS: duration of a run that is compared with the prediction, in time constants of the
 # slowest pole. PATIENCE: largest duration of a random run, in settling times of the slowest pole.
 _CONSTANTS, PATIENCE = 3.0, 3.0
-_STEP = 0.25  # time step times the fastest pole
-_WIDEST = 10.0  # largest joint displacement [rad] to which the step is adapted
-_FINER, _FINEST = 8, 2  # factor by which steps are shortened if a run diverges, and how often
+_STEP = 0.25  # time step times the fastest rate, which is `pace` [1/s] in `Loop.runs`
+_WIDEST = 10.0  # largest joint displacement [rad|m] to which the step is adapted
+# The steps of a diverging run are shortened by the factor _FINER, at most _FINEST times.
+_FINER, _FINEST = 8, 2
 _MOST_STEPS = 1_000_000
-_CHECKS = 60  # comparisons with the prediction in a run
+_CHECKS = 60  # approximate number of comparisons with the prediction in a run of a continuous loop
 
 OUTCOMES = ("slow", "settled", "chart", "diverged")
 
@@ -52,7 +53,7 @@ class Loop:
         K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
         kept = getattr(gain, "regulated", ())
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
-        if part.state_names == kept:  # states that are not fed back do not settle
+        if part.state_names == kept:  # omit states that are not fed back and cannot settle
             K, lin = K @ selection(kept, lin.state_names).T, part
         self.robot, self.lin, self.K = robot, lin, K
         # Map between (q, v) and the full state of the robot, in the frame of the model.
@@ -88,10 +89,11 @@ class Loop:
 
         names, full = self.lin.state_names, self.state.names
         of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # `of` contains the square roots of the weights of velocities, and `size` those of the
-        # weights of coordinates. The root for a coordinate is the root for its velocity times the
-        # decay rate of the loop. Coordinates and velocities are matched by name, because a velocity
-        # can be a state of the model even if its coordinate is not.
+        # Q contains the weights of velocities and coordinates. `of` is {velocity: square root of
+        # its weight}, and the weight is a diagonal entry of M. `size` contains the square root of
+        # the weight of each coordinate: the root for its velocity times the decay rate of the loop.
+        # Coordinates and velocities are matched by name, because a velocity can be a state of the
+        # model even if its coordinate is not.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
         size = [self.decay * of[rates[name]] for name in names if name not in of]
         Q = np.diag(np.array([*size, *of.values()]) ** 2)
@@ -131,14 +133,16 @@ class Loop:
     ) -> CampaignJob:
         """Return a job that simulates the loop from displaced states.
 
-        A run ends when it settles or diverges, or after PATIENCE settling times. If `predicts` is
-        true, a run always lasts _CONSTANTS time constants, and is compared with the linear loop.
-        `joint` is the largest displacement of a joint [rad|m]. `fine` is the number of times that
-        the steps are shortened by the factor _FINER.
+        If `predicts` is true, a run lasts _CONSTANTS time constants, and is compared with the
+        linear loop. If `predicts` is false, a run ends when it settles or diverges, or after
+        PATIENCE settling times. `joint` is the largest displacement of a joint [rad|m]. `fine` is
+        the number of times that the steps are shortened by the factor _FINER.
         """
         lin, decay = self.lin, self.decay
-        # The step depends on the poles of both the closed and the open loop, because the loop is
-        # open between samples and at saturation.
+        # `fastest` is the fastest rate in a run. A continuous loop is open only at saturation, so
+        # `fastest` is the larger of the open-loop and the closed-loop rates. A sampled loop is open
+        # between samples, so `fastest` is twice the fastest open-loop rate. In both cases, the
+        # decay rate of the closed loop is also taken into account, by the term 4 * decay in `pace`.
         free = linearize(self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
         rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
         fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
@@ -167,10 +171,11 @@ class Loop:
     def _transition(self, dt: float, every: int) -> Array:
         """Return the transition matrix of the linear loop from one check to the next.
 
-        For a linear system, the integrator CF4 equals the classical Runge-Kutta method. Each step
-        then multiplies the state by the fourth-order Taylor polynomial of the matrix exponential.
-        The linear loop uses the same polynomial. Therefore only nonlinear terms can cause a
-        difference between the simulated loop and the linear loop.
+        In a sampled loop, there is one check per sample, and the matrix is A - B K. In a continuous
+        loop, the matrix is computed with the steps of the integrator CF4. For a linear system, CF4
+        equals the classical Runge-Kutta method: each step multiplies the state by the fourth-order
+        Taylor polynomial of the matrix exponential. Because the linear loop uses the same
+        polynomial, only nonlinear terms can cause a difference from the simulated loop.
         """
         if self.lin.dt:
             return self.rate
@@ -190,8 +195,9 @@ class Loop:
     def _judged(self, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
         """Return {"outcome": indices (N,) into OUTCOMES, "error": relative prediction errors (N,)}.
 
-        `step` is the transition matrix of the linear loop from one history entry to the next. If it
-        is None, runs are not compared with the linear loop.
+        `step` is the transition matrix of the linear loop from one history entry to the next. If
+        `step` is None, runs are not compared with the linear loop. The prediction error is NaN if a
+        run leaves the chart or diverges.
         """
         e, stop = runs["state_errors"][..., self.model_states], runs["stop"]
         last, first = self.size(runs["x"][:, self.model_states] - self.lin.x0), self.size(e[:, 0])

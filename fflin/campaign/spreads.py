@@ -16,7 +16,7 @@ from fflin.base.writing import as_path
 
 Inverse: TypeAlias = Callable[[Array], Array]  # inverse distribution function
 
-SEED = "noise"  # name of the seed of noise among the drawn values; a seed has no correlation
+SEED = "noise"  # name of the noise seed among the drawn values; its correlation is omitted
 
 _TABLE = "dispersions"
 _FORMS = ("normal", "uniform", "values", "distribution")
@@ -33,7 +33,7 @@ class DispersionFile(dict[str, object]):
 
 
 def placed(dispersions: object) -> AbstractContextManager[None]:
-    """Return a context manager that adds the file and line to errors about a spread."""
+    """Return a context manager that adds the file and line of a `DispersionFile` to errors."""
     if isinstance(dispersions, DispersionFile):
         return dispersions.document.located(_TABLE)
     return nullcontext()
@@ -169,7 +169,7 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
-        except Exception:  # any object may have a ppf
+        except Exception:  # `ppf` may be the method of any object, and raise any exception
             middle = np.nan
         if not np.isfinite(middle):
             raise InputError(

@@ -251,6 +251,7 @@ def validity(
     total = len(first) + samples
     with how:
         # A random run usually settles, and ends, after about 1 / PATIENCE of its largest duration.
+        # So all random runs take about as long as `few` runs of the largest duration.
         few = math.ceil(samples / PATIENCE)
         expect(progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
         told = progress and partial(_report, progress, 0, total)
@@ -297,15 +298,18 @@ def _slope(errors: Array) -> float:
 
 
 def _crossing(errors: Array) -> float:
-    """Return the level at which the relative error reaches TRUSTED, interpolated between levels."""
+    """Return the level at which the relative error reaches TRUSTED, interpolated between levels.
+
+    If no error exceeds TRUSTED, return 1.
+    """
     beyond = np.flatnonzero(~(errors <= TRUSTED))
     if not len(beyond):
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
-        # The error cannot be interpolated below the first level, or if a run at level `first` left
-        # the chart or diverged. In these cases, the error is assumed to be proportional to the
-        # level.
+        # Below the smallest level, the error is not known. If a run left the chart or diverged, the
+        # error at the index `first` is NaN. In both cases, the error is not interpolated, but
+        # assumed to be proportional to the level. If errors[0] is NaN, the result is 0.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
         return near if np.isfinite(errors[0]) else 0.0
@@ -341,7 +345,7 @@ def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
 
 
 def joint_unit(lin: LinearModel) -> str:
-    """Return the unit of the joints: "rad|m" if the model has revolute and prismatic joints."""
+    """Return the unit that all joints of the model share, or "rad|m" if there is no such unit."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
     of = {unit for name, unit in pairs if name.startswith("q_m.")}
     return of.pop() if len(of) == 1 else "rad|m"

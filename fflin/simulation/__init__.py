@@ -1,4 +1,4 @@
 """Simulation of the nonlinear closed loop. Its result is a `Motion`.
 
-Imports `base`, `robot`, `dynamics`, `linear` and `control`.
+Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

@@ -38,7 +38,7 @@ LONG = 20_000
 SLOTS = 128  # number of samples for which noise is stored at once
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
-# {name of an array of the loop: values (N, size) in each of N runs}; see `Dispersions.in_lanes`.
+# {name of an array of the loop: values (N, size), one row per run}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
 
@@ -91,7 +91,8 @@ def noise_generator(seed: float) -> np.random.Generator:
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
     """Return the indices (k,) and the sensor noise (k, size) of the samples in a range of steps.
 
-    The range begins with `step` and ends before `last`.
+    The range begins with `step` and ends before `last`. The policy must be sampled. If the policy
+    defines no noise, the noise is zero.
     """
     times = plan.times
     at = np.arange(-(-step // times.sample), -(-last // times.sample))
@@ -142,7 +143,7 @@ class LaneLoop:
         if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
         stop = stop_conditions(plan)
-        if runs:  # dispersed runs start with a positive q0; see `StopConditions`
+        if runs:  # at the start of dispersed runs, q0 of `StopConditions` is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan, self._state = plan, plan.plant.state
@@ -164,7 +165,8 @@ class LaneLoop:
         """Simulate up to eight runs; return why each run ended early, or an empty text.
 
         `runs` contains the values that differ between the runs. Without `runs`, the plan itself is
-        simulated. Row i of each array in `out` receives the outcome of run i.
+        simulated. Row i of each array in `out` receives the outcome of run i. If
+        `statistics.over` ends a run, the returned text is empty.
         """
         times, every, point = self._plan.times, statistics.every, self.parts.point
         steps, count = times.steps, len(next(iter(out.values()))) if out else 1
@@ -216,8 +218,9 @@ class LaneLoop:
     def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
         """Write the initial values of all runs; return a function that writes sensor noise.
 
-        Call this function before each slice of steps. Its arguments are the first step of the slice
-        and the step after the last one.
+        `of_lane` (LANES,) contains the index of the run in each lane. The returned function must be
+        called before each slice of steps. Its arguments are the first step of the slice and the
+        step after the last one.
         """
         for array, initial in self._fresh:
             array[:] = initial
@@ -300,8 +303,8 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
-    The squared rates in `stop` are in the order of v. If `noisy`, the law stores the noise of SLOTS
-    samples, even if the policy defines no noise.
+    `stop.squares` (nv,) must contain the squared limits of the entries of v. If `noisy` is true,
+    the law stores the noise of SLOTS samples, even if the policy defines no noise.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state

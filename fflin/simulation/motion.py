@@ -145,7 +145,7 @@ class Motion(Design):
     stopped: str
     com_drift: Vector = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
-    _nominal: str = field(default="", kw_only=True)  # checksum of a campaign's robot; not saved
+    _nominal: str = field(default="", kw_only=True)  # checksum of the nominal robot; not saved
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Vector = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
@@ -348,7 +348,8 @@ def require_motion(motion: object) -> Motion:
 def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
     """Convert rows q (N, nq) and v (N, nv) of the robot `other` to the coordinates of `robot`.
 
-    Joints that `other` lacks are at rest, at their positions in the configuration `last` (nq,).
+    Joints that `other` lacks are at rest, at their positions in `last` (nq,), a configuration of
+    `robot`.
     """
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:

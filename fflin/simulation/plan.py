@@ -35,7 +35,7 @@ Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 
 # SHORTEST and LONGEST are the bounds [s] of an automatic duration. The duration is determined by a
-# linear simulation. If the loop is in continuous time, its time step is _LOOK [s].
+# linear simulation. If the loop is in continuous time, the simulation has the time step _LOOK [s].
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 _STEP = 0.01  # [s] default time step
 # The inputs of a trajectory may jump at the knots of the trajectory. In this case, the last stage
@@ -156,9 +156,9 @@ class Plan:
         # Whether each step ends with a correction that sets momentum and centre of mass to their
         # predicted values. In orbit, momentum is not conserved, so there is no correction.
         self.project = truth("project", options.project) and robot.orbit is None
-        # Indices in v of the rates that are limited, so that no rotation per step is too large: the
-        # angular velocity of the base, and the rates of revolute joints. Rotors are excluded,
-        # because nothing depends on the angle of a rotor.
+        # Indices in v of the rates that end the run if the rotation per step exceeds LARGEST_TURN:
+        # the angular velocity of the base, and the rates of all joints that are not prismatic.
+        # Rotors are excluded, because nothing depends on the angle of a rotor.
         rotors, joints = robot.rotors, robot.joints
         turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
         self.turning = np.array([3, 4, 5, *turning])
@@ -300,7 +300,7 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         )
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
     thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
-    # If the policy is sampled and not every step is recorded, record only at samples.
+    # If `every` is chosen automatically, rows of a sampled policy are recorded only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
     if thinned:
@@ -330,8 +330,9 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
 def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
     """Return the sample time [s] or None, and the rate [1/s] of the fastest pole or 0.
 
-    For a sampled policy, return its sample time and 0. For a continuous policy, return None and the
-    absolute value of the fastest pole of the closed loop, or None and 0 if this pole is not known.
+    If the argument `sample` is given, return `sample` and 0. For a sampled policy, return its
+    sample time and 0. For a continuous policy, return None and the absolute value of the fastest
+    pole of the closed loop, or None and 0 if this pole is not known.
     """
     follows, by = tracking_of(policy), decider(policy)
     if sample is not None:

@@ -119,7 +119,8 @@ def plot_motion(
             if motion.tracked and [title] == states[:1]:
                 axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
             if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
-                # Joint names are long, so a legend below the charts names the joints of all charts.
+                # Long joint names, or many names, do not fit into a chart. Their legends are below
+                # all charts. One legend names the joints of all charts.
                 named = legends.setdefault("joints" if group in JOINTS else title, {})
                 named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
             else:

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 # An error has settled once it stays below this fraction of its largest value.
 SETTLED = 0.02
 
-# If an error [SI units] never exceeds THERE, it counts as zero throughout the run. A value below
-# _NOTHING appears as a dot in tables. Both limits exceed the rounding errors of a robot at rest.
+# If an error never exceeds THERE, it counts as zero throughout the run. The errors are in SI units,
+# or in deg for the attitude. A value below _NOTHING appears as a dot in tables. Both limits exceed
+# the rounding errors of a robot at rest.
 THERE, _NOTHING = 1e-9, 1e-14
 
 # An error counts as settled only if it stays small during the last part of a run. DWELL is the
@@ -64,7 +65,7 @@ class Curve(NamedTuple):
     """
 
     key: str  # GROUP.NAME
-    group: str  # "speed" or "momentum" for wheels
+    group: str  # GROUP, but "speed" or "momentum" for the speed or momentum of a wheel
     name: str
     unit: str
     values: Array
@@ -89,7 +90,7 @@ class Curve(NamedTuple):
 
 
 def curves(motion: Motion) -> Iterator[Curve]:
-    """Yield the curves of all states except wheel angles, of wheel momenta, and of all inputs."""
+    """Yield the curves of states, wheel momenta and inputs; wheel angles are excluded."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
     unlimited = np.full(2, np.inf)

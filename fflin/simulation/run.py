@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 # base, torque on the base, forces or torques of the joints. The first two are in base axes.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
-# Above this velocity [SI units], the motion has diverged. After this point, a disturbance that is
-# not finite raises no error.
+# If an entry of v exceeds this magnitude [SI units], the motion counts as diverging. In a diverging
+# motion, a disturbance that is not finite raises no error.
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -79,7 +79,8 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         self._columns = state.lift(self.actuation.fixed)
-        # True if B_u is constant, and the inputs are the only forces apart from a disturbance.
+        # True if the generalised force of the inputs is `_columns` @ u, and no other force acts,
+        # apart from a disturbance. Mimic joints and modes are excluded.
         others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
@@ -120,8 +121,9 @@ class Plant(Aba):
     def isolated(self, *, driven: bool) -> bool:
         """Return True if no external force acts on the robot.
 
-        If `driven` is true, the inputs may be nonzero, and inputs that act on the base count as
-        external forces. Gravity and a disturbance are always external. In orbit, return False.
+        If `driven` is true, or if an actuator fault has a bias, the inputs may be nonzero. In this
+        case, forces and torques on the base, thrusters, and wheels without a joint count as
+        external. Gravity and a disturbance are always external. In orbit, return False.
         """
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
@@ -177,7 +179,8 @@ class Conserved:
     def wrench(self, q: Array, push: Array) -> Array:
         """Return the wrench (6,) about the fixed point in world axes, including the weight.
 
-        `push` (6,) is the wrench in base axes without the weight. In orbit, return `push` itself.
+        `push` (6,) is the wrench about the base, in base axes and without the weight. In orbit,
+        return `push` itself.
         """
         if self._field:
             return push
@@ -237,13 +240,14 @@ class Conserved:
 
         - the energy (N,);
         - the momentum about the centre of mass (N, 6);
-        - the centre of mass (N, 3);
+        - the centre of mass (N, 3) relative to the fixed point;
         - the momentum about the fixed point (N, 6);
         - the upper bounds (2,) of linear and angular momentum (11.5).
 
-        In orbit, the energy is the Jacobi integral. The momentum about the fixed point is replaced
-        by the Jacobi integral and five zeros. The bounds are replaced by the size of the largest
-        terms of the Jacobi integral and a zero.
+        A momentum (6,) consists of linear and angular momentum, in world axes. In orbit, the energy
+        is the Jacobi integral. The momentum about the fixed point is replaced by the Jacobi
+        integral and five zeros. The bounds are replaced by the size of the largest terms of the
+        Jacobi integral and a zero.
         """
         model, data, robot = self._model, self._data, self._robot
         rows, near = len(q), q.copy()
@@ -367,7 +371,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
-    """Return the stop conditions of a run; `squares` (nv,) is in the order of v."""
+    """Return the stop conditions of a run; `squares` has the squared limits of the entries of v."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.turning] = plan.times.slow
     # If the policy has a linear model, the run ends when the base leaves the attitude chart.
