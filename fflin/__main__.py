@@ -25,7 +25,7 @@ def main() -> int:
     if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
-    gc.set_threshold(50_000)  # a command keeps most of its objects until it ends
+    gc.set_threshold(50_000)  # search rarely for cycles, because most objects live until the end
     try:
         from fflin.commands import cli
 
@@ -55,7 +55,7 @@ def leave(reason: BaseException) -> NoReturn:
         sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:  # the reader of the output has gone
+    except OSError:  # the program that reads the output has ended
         pass
     finally:
         os._exit(INTERRUPTED)

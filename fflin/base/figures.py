@@ -36,12 +36,15 @@ def cycle(count: int) -> list[str]:
 
 
 def letters_of(count: float, height: float) -> float:
-    """Return the font size [pt] at which `count` lines fit into a height [pt]."""
+    """Return the font size [pt], at most 8, at which `count` lines fit into a height [pt]."""
     return min(8.0, 0.75 * height / max(1, count))
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Give an axis a symmetric logarithmic scale if the magnitudes of `values` span a decade."""
+    """Set a symmetric logarithmic scale on an axis if the magnitudes of `values` span a decade.
+
+    Magnitudes up to 1e-9 times `unit` are ignored.
+    """
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return

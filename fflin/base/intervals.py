@@ -31,11 +31,14 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
-    """Return success statistics of N runs, sorted by increasing initial displacement.
+    """Return success statistics of N runs.
 
-    `failed` (N,) is true for each failed run. The statistics are the number of runs before the
-    first failure, a lower bound on the success rate at the displacements of these runs, and a
-    confidence interval for the success rate of all runs.
+    `failed` (N,) is true for each failed run. The runs must be sorted by increasing initial
+    displacement. The statistics are
+
+    - the number of runs before the first failure;
+    - a lower bound on the success rate at the displacements of these runs;
+    - the confidence interval (low, high) for the success rate of all runs.
     """
     count = len(failed)
     inside = int(failed.argmax()) if failed.any() else count
@@ -75,7 +78,8 @@ def mean(values: Array, confidence: float) -> Estimate:
 def rank_correlations(columns: Array, values: Array) -> Array:
     """Return Spearman's rank correlation (k,) of each column with `values`.
 
-    `columns` is an array (N, k). `values` is an array (N,), which may contain inf.
+    `columns` is an array (N, k). `values` is an array (N,), which may contain inf. The correlation
+    with a constant array is 0.
     """
     ranks = np.empty((len(values), columns.shape[1] + 1))
     for k, column in enumerate((*columns.T, values)):

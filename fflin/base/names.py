@@ -113,7 +113,10 @@ def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
 def joints_by_name(
     kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], object]
 ) -> dict[str, T]:
-    """Return {joint: value} from {joint, pattern or ``q_m``: value}; `find` checks one name."""
+    """Return {joint: value} from {joint, pattern or ``q_m``: value}.
+
+    `find` must raise an error for an invalid joint name.
+    """
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
     states = [f"q_m.{name}" for name in joints]
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}

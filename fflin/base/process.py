@@ -28,7 +28,7 @@ class Progress:
         self.done, self.total = 0, 0
 
     def expect(self, seconds: float, cores: int) -> None:
-        """Before a computation, print its estimated duration, if this is at least 10 s."""
+        """Print the estimated duration of a computation, if it is at least 10 s."""
         if seconds < _WORTH:
             return
         size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
@@ -50,7 +50,10 @@ class Progress:
             self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
     def say(self, text: str) -> None:
-        """Show a line of text in the bar's place, for example for work of unknown length."""
+        """Show a line of text in the bar's place, for example for work of unknown length.
+
+        A text is ignored if it comes less than 0.1 s after the last shown text.
+        """
         if self._shown and (now := time.monotonic()) >= self._next:
             self._next, self._drawn = now + _INTERVAL, True
             print(f"\r\x1b[2K{text}", end="", file=sys.stderr, flush=True)
@@ -70,7 +73,7 @@ def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> 
     """Return whether two paths lead to one file or folder; "" means the working folder."""
     try:
         return os.path.samefile(first or os.curdir, second or os.curdir)
-    except (OSError, ValueError):  # one of the paths does not exist
+    except (OSError, ValueError):  # a path does not exist or is invalid
         return False
 
 

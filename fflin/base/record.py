@@ -1,8 +1,9 @@
-"""Records on disk, which consist of named arrays, strings, lists of strings, and numbers.
+"""Records on disk: named arrays, strings, lists of strings, numbers, and groups of numbers.
 
 Models, gains, schedules, filters and motions are saved as records. Any program that reads .npz,
-.mat or .json can read them. Each file contains a SHA-256 digest. If the content does not match the
-digest, the file was damaged or edited, and is refused. The formats store the digest as follows:
+.mat or .json can read them. A file normally contains a SHA-256 digest. If the content does not
+match the digest, the file was damaged or edited, and is refused. The formats store the digest as
+follows:
 
 - .npz: the entry ``sha256`` is the digest of the other entries;
 - .json: the entry ``sha256`` is the digest of the text before it;
@@ -72,7 +73,8 @@ def reading(path: Path, what: str) -> Iterator[None]:
     """Turn errors into `FileError` in a ``with`` block that reads a file."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # SciPy takes damaged headers for old ones
+            # SciPy may mistake a damaged .mat file for an older format, and then warns.
+            warnings.simplefilter("ignore")
             yield
     except (FileError, MissingPackageError):
         raise
@@ -117,8 +119,8 @@ def figures(value: object) -> dict[str, float]:
 def content_digest(entries: Mapping[str, object]) -> str:
     """Return the SHA-256 of named arrays or bytes, including their names, types and shapes.
 
-    The formats .npz and HDF5 use this digest. The bytes of each entry are hashed in blocks of 4
-    MiB.
+    The formats .npz and HDF5 use this digest. Each entry is split into blocks of 4 MiB. The digests
+    of these blocks are hashed in place of the bytes of the entry.
     """
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
@@ -146,8 +148,8 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
-    # The archive ends with the number of its entries. If a damaged length field hides some entries,
-    # NumPy reads fewer entries than this number.
+    # The last 22 bytes of the archive contain the number of its entries. If a damaged length field
+    # hides some entries, NumPy reads fewer entries than this number.
     end = content[-22:]
     if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
         raise ValueError(DAMAGED)
@@ -198,9 +200,9 @@ def _of_mat(value: object) -> object:
         return value
     if value.dtype.names:
         return {name: _of_mat(value[name].item()) for name in value.dtype.names}
-    if value.dtype.kind == "U":  # an empty text has no row
+    if value.dtype.kind == "U":
         rows = [str(row).rstrip() if value.size > 1 else str(row) for row in value.ravel()]
-        return rows if len(rows) > 1 else "".join(rows)
+        return rows if len(rows) > 1 else "".join(rows)  # an empty text has no rows
     return [_of_mat(cell) for cell in value.ravel(order="F")] if value.dtype.kind == "O" else value
 
 
@@ -241,7 +243,7 @@ CODECS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(Result):
-    """Result of arrays, names and numbers that can be saved and loaded; its arrays are read-only.
+    """Base class of results that can be saved and loaded; their arrays are read-only.
 
     Attributes
     ----------

@@ -34,9 +34,9 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 
 def is_number(value: object) -> bool:
-    """Return whether a TOML value is a finite number."""
-    # The limit 1e100 keeps the norm of a vector of such numbers finite. It also excludes integers
-    # that are too large for a float.
+    """Return whether a TOML value is a number with a magnitude below 1e100."""
+    # The limit keeps the norm of a vector of such numbers finite. It also excludes inf, nan, and
+    # integers that are too large for a float.
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100
 
 
@@ -54,7 +54,8 @@ class TomlFile:
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             found = re.search(r"at line (\d+)", str(error))
-            last = getattr(error, "start", len(content.rstrip()))  # first byte that is not UTF-8
+            # `start` is the index of the first byte that is not UTF-8.
+            last = getattr(error, "start", len(content.rstrip()))
             line = found[1] if found else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
@@ -90,7 +91,8 @@ class TomlFile:
     def located(self, *table: str | int, of: str = "") -> Iterator[None]:
         """Put a location and the prefix `of` before the message of an error in a ``with`` block.
 
-        The location is the file and the line of the key that the message names.
+        The location is the file, and the line of the key in `table` that the message names. If the
+        message names no key, it is the line of `table`.
         """
         try:
             yield

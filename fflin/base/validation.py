@@ -32,8 +32,8 @@ else:
 
 T = TypeVar("T")
 
-# Largest error of the squared length of a quaternion or (cos, sin) pair that counts as rounding.
-# Up to this error, the quaternion or pair is renormalised. A larger error counts as wrong input.
+# If the squared length of a quaternion or (cos, sin) pair differs from 1 by at most this value, the
+# quaternion or pair is normalised. A larger difference counts as wrong input.
 NORM_TOLERANCE = 1e-6
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
@@ -125,7 +125,7 @@ def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int
 
 
 def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:
-    """Return a mapping whose keys are names, or raise `InputError`."""
+    """Return a mapping, or raise `InputError`; in the message, `of_what` is the noun for a key."""
     return instance(name, value, Mapping, f"{{{of_what}: value}}")
 
 
@@ -171,7 +171,7 @@ def is_rotation(R: Array) -> bool:
 
 
 def as_double(name: str, value: object) -> Array:
-    """Return a new array of native floats, or raise `InputError` if an entry is not a number."""
+    """Return a new array of native floats; raise `InputError` if an entry is not a real number."""
     refuse_masked(name, value)
     array = _as_array(name, value)
     if array.dtype.kind not in "fiu":

@@ -96,7 +96,10 @@ def files_of_command(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterato
 
 
 def remember(*paths: str | Path) -> None:
-    """Register files that a command reads, so that it cannot overwrite them."""
+    """Register files that a command reads, so that it cannot overwrite them.
+
+    Raise `FileError` if one of the files is an output of the command.
+    """
     outputs, inputs = _of_command.get() or (set(), set())
     inputs.update(map(os.path.abspath, paths))
     for target in outputs:
@@ -158,7 +161,8 @@ def install(temporary: Path, target: Path) -> None:
 def followed_path(target: Path) -> Path:
     """Return the file to which a target's links lead.
 
-    Raise `FileError` if this file cannot be written, or if the command reads it.
+    Raise `FileError` if this file is not a regular file, if its folder does not exist, or if the
+    command reads it.
     """
     real = Path(os.path.realpath(target))
     with _failing(target, "written"):
@@ -195,7 +199,10 @@ def check_distinct(*targets: Path | None) -> None:
 
 
 def missing(path: Path, otherwise: str = "") -> str:
-    """Return the end of a message on a missing file: its folder, and similar names there."""
+    """Return the end of a message on a missing file: its folder, and similar names there.
+
+    If there are no similar names, the message ends with `otherwise`.
+    """
     import difflib
 
     try:
@@ -210,7 +217,7 @@ def missing(path: Path, otherwise: str = "") -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return in one line why a file could not be opened."""
+    """Return in one line why a file could not be read or written."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if isinstance(error, KeyError) and said.strip("'").isidentifier():
         said = f"it has no entry {said}"

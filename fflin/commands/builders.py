@@ -69,7 +69,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         if (value := getattr(arguments, name, None))
     }
     # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
-    # settings are applied after loading.
+    # settings in `given` are applied after loading.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
@@ -141,7 +141,7 @@ def state_of(
     option, names = f"--{prefix}".replace("_", "-"), robot.joint_names
     values = once(f"{option}joint", given.pop("joint"))
     rates = once(f"{option}velocity", given.pop("velocity", []))
-    fflin.velocity(robot, rates)  # raises an error if it is invalid
+    fflin.velocity(robot, rates)  # raises an error for invalid `rates`
     given["joints"] = joints_by_name("joint", values, names, robot.joint)
     given["velocity"] = rates_by_name(names, rates)
     state = reduce(combined, (*states, given))
@@ -191,9 +191,10 @@ def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
 def model_about(
     robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
 ) -> fflin.LinearModel:
-    """Linearise about q (nq,) and v (nv,), with inputs from --effort or --equilibrium.
+    """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium.
 
-    With --reduce, the conserved momenta are removed from the model.
+    --equilibrium and --relative-equilibrium compute the inputs of an equilibrium, and add the
+    spring deflections to q. With --reduce, the conserved momenta are removed from the model.
     """
     axes = {"frame": arguments.frame, "reference": reference}
     given = once("--effort", arguments.effort)
@@ -273,7 +274,11 @@ def weights_of(arguments: Namespace) -> dict[str, object]:
 
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
-    """Return the regulator of a model with the weights of the options; warn of small margins."""
+    """Return the regulator of a model, and warn of small margins or negative thrust.
+
+    The options --weights, --q, --r and --bryson define the weights. With --sample, the model is
+    first discretised. If `allocated` is true, the error for an unknown name mentions --no-allocate.
+    """
     from fflin.control.gain import cautions
     from fflin.control.lqr import require_fixed_point
 
@@ -291,7 +296,7 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
 
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
-    """Return the policy that the arguments define, and keyword arguments of `simulate`."""
+    """Return the policy (None with --free), and keyword arguments of `simulate`."""
     from fflin.simulation.plan import SHORTEST, time_to_settle
 
     settings: dict[str, Any] = {
@@ -326,9 +331,13 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str,
 def start_of(
     robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
-    """Return the initial q (nq,) and v (nv,) from the arguments or the robot."""
+    """Return the initial q (nq,) and v (nv,) from the arguments or the robot.
+
+    With --relative-equilibrium, the given base pose is relative to `reference`, or by default to
+    the pose of this equilibrium.
+    """
     point, number = robot.point, arguments.relative_equilibrium
-    if number:  # the start is relative to this pose, which replaces the pose of the point
+    if number:  # omit the base pose of the point, because the pose `about` below replaces it
         point = {part: point[part] for part in ("joints", "velocity") if part in point}
     rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
     q, v = state_of(robot, arguments, point, {"velocity": rates}, robot.start)
@@ -391,7 +400,8 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
     """Return the linear model about the point for which a gain was designed.
 
     If the base pose of the gain's operating point is the reference of the gain, the new reference
-    is the target pose of the base. Otherwise, the reference of the gain is used.
+    is the target pose of the base. Otherwise, the reference of the gain is used. With
+    --relative-equilibrium, the new reference is always the pose of this equilibrium.
     """
     import pinocchio as pin
 

@@ -54,7 +54,10 @@ _ENTRIES = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; return 0 if it succeeds, 1 if a check fails, 2 for invalid input."""
+    """Run a command and return its exit code.
+
+    The code is 0 for success, 1 if a check fails or a simulation ends early, and 2 for an error.
+    """
     reported: set[str] = set()  # each warning is shown only once
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
@@ -185,7 +188,7 @@ def plain(value: object) -> object:
     """Convert a value for JSON: arrays to lists, results to objects, and inf or NaN to null.
 
     A model or design is converted to the entries of its file. Any other result is converted to its
-    fields.
+    fields. Names that begin with "_" are omitted.
     """
     import numpy as np
 
@@ -214,7 +217,7 @@ def plain(value: object) -> object:
 
 
 def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
-    """Raise `FileError` if a file exists and contains no result of the given `kinds`."""
+    """Raise `FileError` if a non-empty file contains no result of the given `kinds`."""
     if path.suffix == ".csv" and "LinearModel" in kinds:
         from fflin.linear.files import foreign_table
 
@@ -254,6 +257,6 @@ def kind_of(path: Path) -> str:
             # Do not call `read_file`, because it would register the file as an input.
             entries, _ = CODECS[path.suffix][1](path.read_bytes())
             names, kind = {*entries}, text(entries.get("kind", ""))
-    except Exception:  # each decoder raises its own types
+    except Exception:  # each decoder raises its own types of errors
         return ""
     return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")

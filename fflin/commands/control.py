@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
 
-_ROWS = 240  # number of times at which errors and inputs are plotted
+_ROWS = 240  # number of instants per run at which --plot shows errors and inputs
 _RUNS = ("dt", "knots", "samples", "seed", "confidence", "threads")
 
 _ALLOCATED = (
@@ -325,7 +325,8 @@ def _points(
 def going_on(path: Path | None, what: str) -> Iterator[Progress]:
     """Return a context with a progress bar.
 
-    After Ctrl-C, the raised `KeyboardInterrupt` states how to resume the command.
+    After Ctrl-C, the raised `KeyboardInterrupt` states the progress and, if the command can be
+    resumed, how to resume it.
     """
     from fflin.batch.files import part_of
 

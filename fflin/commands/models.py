@@ -31,7 +31,7 @@ from fflin.commands.builders import (
 # Entries of f0 [SI] up to this magnitude count as zero.
 _MOVES = 1e-9
 
-_SLACK = 1e-9  # [SI]; a value counts as at its limit within this distance
+_SLACK = 1e-9  # [SI]; an excess over a limit is reported only if it is larger than this
 
 
 def robots(_: Namespace) -> Report:
@@ -206,8 +206,9 @@ def model_report(lin: fflin.LinearModel) -> str:
     head += f"; the operating point is {point}"
     parts = [folded([head, *_units(lin)])]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Report unstable poles only at an equilibrium, because poles do not determine the stability of
-    # a motion. If A^2 = 0, do not compute the poles, because all of them are zero.
+    # Report unstable poles only for a continuous model at an equilibrium. Away from an equilibrium,
+    # poles do not determine stability. If A^2 = 0, do not compute the poles, because all of them
+    # are zero.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
     if growing := fflin.modes(lin).unstable if moving else ():
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)

@@ -146,12 +146,12 @@ def one(
     default: float | str | None = None,
     **more: object,
 ) -> Form:
-    """Return the `Form` of an option that may be given only once."""
+    """Return the `Form` of an option of which only the last occurrence counts."""
     return {"type": reader, "metavar": metavar, "default": default, **more}
 
 
 def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
-    """Return the `Form` of an option that may be repeated."""
+    """Return the `Form` of a repeatable option, whose values form a list."""
     return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
 
 

@@ -24,7 +24,8 @@ _NAMES = (
     *("microsoft-edge", "msedge"),
 )
 
-# Options that enable WebGL without a graphics card, and disable background network access.
+# Options for a headless browser, which reads its commands from a pipe. They also enable WebGL
+# without a graphics card, and disable background network access.
 _ARGUMENTS = (
     *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
@@ -37,7 +38,9 @@ _ARGUMENTS = (
 # this process. When this process ends, the pipes are closed, and Chromium exits.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
-_PATIENCE = 120.0  # [s] time limit, long enough for a slow machine without a graphics card
+# Time limit of a browser [s], to which 3 s are added for each picture. The limit is long enough for
+# a slow machine without a graphics card.
+_PATIENCE = 120.0
 
 # Sizes [px] of a single picture of the whole page, of a picture in a strip, and of a GIF.
 _PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
@@ -122,7 +125,10 @@ def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -
 
 @contextmanager
 def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
-    """Run a browser for at most `patience` seconds; then remove the folder of temporary files."""
+    """Yield a browser and its folder of temporary files, which is removed at the end.
+
+    After `patience` seconds, the browser is killed.
+    """
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
@@ -162,7 +168,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 class _BrowserError(Exception):
-    """Error that the browser returns for a command."""
+    """Error for a command that fails in the browser or gets no answer."""
 
 
 class _Browser:

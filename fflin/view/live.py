@@ -35,8 +35,9 @@ Request: TypeAlias = "Mapping[str, Mapping[str, float]]"
 class Live:
     """Live view of a robot in a browser; `visualize(robot)` returns it.
 
-    A thread of this process serves the page, to this machine only, until the process ends. If the
-    viewer is given to `simulate` as its callback, it shows the running simulation.
+    A thread of this process serves the page, to this machine only, until the viewer is closed or
+    the process ends. If the viewer is given to `simulate` as its callback, it shows the running
+    simulation.
 
     Attributes
     ----------

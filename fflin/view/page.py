@@ -105,7 +105,7 @@ def body_poses(robot: Robot, q: Array) -> Array:
 
 
 class Drawing:
-    """Drawing of a robot below a node of a page's scene, with a child node for each body.
+    """Drawing of a robot at a node of a page's scene, with a child node for each body.
 
     The constructor adds notes about missing drawings to `page.notes`. If `look` is "real" or
     "held", the constructor also adds the links of the robot to `page.links`.
@@ -152,7 +152,7 @@ class Drawing:
                 }
                 self._send("set_object", body[f"{index}_{part}"], object=content)
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        # {Pinocchio joint: corners (8, 3) of its body's bounding box}
+        # {Pinocchio joint: corners (8, 3) of its body's bounding box, in the frame of this body}
         self.corners = {
             joint: _box_corners(np.eye(4), _bounds(np.concatenate(boxes)))
             for joint, boxes in corners.items()
@@ -190,7 +190,7 @@ class Drawing:
 
 
 def _link(robot: Robot, shape: Shape) -> list[float]:
-    """Return the mass [kg] of a shape's link, then the link's pose (7,) in the joint's frame."""
+    """Return the mass [kg] of a shape's link, then the link's pose (7,) in the body's frame."""
     known = robot.pieces.get(shape.link) or robot.links.get(shape.link)
     mass = known.mass if known else 0.0
     if not robot.model.existFrame(shape.link, pin.FrameType.BODY):  # an inertia box
@@ -275,8 +275,8 @@ class Recorder:
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""
         self.forward = forward
-        # Last command of each kind for each node: {path: {"set_object": command, "set_property
-        # visible": command, ...}}.
+        # Last command of each kind for each node: {path: {"TYPE PROPERTY": command}}. The property
+        # is empty for commands without a property, such as "set_object ".
         self._nodes: dict[str, dict[str, Lowered]] = {}
         self._animation: Lowered | None = None
 
@@ -336,15 +336,15 @@ class Page:
         self, robot: Robot, q: Array, scene: str, tool: str | None, frame: str | None
     ) -> None:
         self.robot, self.scene, self.tool, self.frame = robot, scene, tool, frame
-        self.window, self.sent = Recorder(), set[str]()  # `sent`: meshes that the page has
+        self.window, self.sent = Recorder(), set[str]()  # `sent`: uuids of sent meshes
         self.meshcat = Visualizer(window=self.window)
         self.notes = dict[str, None]()  # notes about missing drawings
-        self.links = dict[str, list[float]]()  # {name: mass [kg] and pose on its joint}
+        self.links = dict[str, list[float]]()  # {link: mass [kg], pose (7,) on its body}
         self.drawing = Drawing(self, robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints (without the universe).
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
-        # For each thruster: the name, the path of the body's node, and the position and direction
-        # of the force on this body.
+        # For each thruster: its name, the path of the node of the body that carries the thruster,
+        # and the position [m] and direction of the force in the frame of this body's joint.
         self.nozzles: list[dict[str, object]] = []
         for item, (name, *_) in robot.named_inputs:
             if isinstance(item, Thruster):
@@ -369,7 +369,8 @@ class Page:
         robot, nodes, orbit = self.robot, self.nodes, dict[str, object]()
         if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
-            # On the page, z points away from the central body, and x along the orbit.
+            # The rows of "up" are the axes of the page in the orbital frame: x along the orbit, y
+            # (upwards) away from the central body, and z opposite to the orbit normal.
             radial, along, normal = field.axes.T
             far = robot.orbit.radius / robot.orbit.body_radius
             rate = robot.orbit.mean_motion

@@ -48,7 +48,7 @@ _STEP, _SWING = 0.05, 0.3
 # Largest number of frames. More frames would enlarge the file without a visible effect.
 _MOST_FRAMES = 3000
 
-# Values below this, in SI units, count as rounding errors.
+# Values below this, in the units of the page, count as rounding errors.
 _NOTHING = 1e-14
 
 # A curve is not drawn if its largest magnitude is less than this fraction of the largest magnitude
@@ -66,7 +66,9 @@ def motion_page(
     frame = frame_of(robot, motion.frame)
     t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:  # `states` has no row, one row for a fixed target, or one per frame
+    if target is None:
+        # At the end, `states` has one row for a fixed target, one row per frame for a moving
+        # target, and no row without a target.
         states = motion.target.reshape(-1, state.nx)
         states = states[shown] if len(states) > 1 else states
         goal = state.points(states)[1]
@@ -128,7 +130,10 @@ def motion_page(
 
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
-    """Return points (M, 3) that the camera must show: corners of bodies, tips of force arrows."""
+    """Return points (M, 3) that the camera must show: corners of bodies, tips of force arrows.
+
+    If `follow` is true, the displacement of the base from the first frame is subtracted.
+    """
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
@@ -170,7 +175,7 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
 
 
 def moved(poses: Array, point: Array) -> Array:
-    """Return the world positions (N, 3) of a point (3,) in a frame with poses (N, 7)."""
+    """Return the world positions (N, 3) of a point (3,) fixed in a frame with poses (N, 7)."""
     found: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
     return found
 
@@ -301,7 +306,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
-    if len(motion.com_drift):  # empty in orbit, and in some files
+    if len(motion.com_drift):  # empty in orbit, and if a file lacks it
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     for title, whole in charts(motion).items():
         lines = []

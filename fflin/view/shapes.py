@@ -35,17 +35,21 @@ _DENSITY = 1000.0  # [kg/m^3] density of a ball that represents a mass
 
 @dataclass(frozen=True)
 class Shape:
-    """Visual geometry that is rigidly fixed to a body of a robot."""
+    """Visual geometry that is rigidly fixed to a body of a robot.
+
+    The body's frame is the frame of `joint`. For links on a flexible appendage, `joint` is the
+    joint of the first mode, and the body's frame is the appendage's frame after bending.
+    """
 
     joint: int  # Pinocchio joint that moves the shape
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
     size: tuple[float, ...]  # [m] sides, radius, or radius and length; scale of a mesh
-    placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
+    placement: pin.SE3  # in the body's frame; the axis of a cylinder is z
     color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
-    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's placement on the joint
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's pose in the body's frame
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -279,9 +283,9 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 # triangles of most CAD meshes.
 _RESOLUTION = 1.0 / 400.0
 
-# Largest number of triangles that are drawn for a mesh file. Vertices in the same cell of a grid
-# are merged. The grid is made coarser until at most this number of triangles remain, or until the
-# cells are larger than 2 % of the largest extent of the file's meshes.
+# Desired largest number of triangles for a mesh file. Vertices in the same cell of a grid are
+# merged. The grid is made coarser until at most this number of triangles remain, or until the cells
+# are larger than 2 % of the largest extent of the file's meshes.
 _LARGEST = 20_000
 
 

@@ -228,7 +228,10 @@ def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, 
 
 
 def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
-    """Return the tool frame: by default "tool" if it exists, else the end of the longest chain."""
+    """Return the tool frame: by default "tool" if it exists, else the end of the longest chain.
+
+    For a robot without joints, there is no default tool frame, and the result is None.
+    """
     if tool is not None:
         find_frame(robot.model, tool)
         return tool
