@@ -19,7 +19,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
-from fflin.kernel.vectors import called, load, root, store
+from fflin.kernel.vectors import Entries, called, load, root, store
 
 # The cost contains the squares of the inputs, multiplied by LEAST^2. Among inputs with the same
 # effect, this term selects the smallest inputs.
@@ -136,7 +136,7 @@ def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None
     target[:] = factor * source[: len(target)]
 
 
-def least_squares(least, most, size):
+def least_squares(least: Entries, most: Entries, size: int) -> LeastSquares:
     """Return a `LeastSquares` problem with the bounds (k,) for forces (size,), for one lane."""
     count = len(least)
     lengths = dict.fromkeys(("x", "y", "s", "low", "high"), count)
@@ -340,7 +340,7 @@ def _steepest(problem, size):
     return found
 
 
-def nearest(A, b, least, most):
+def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     """Return the u (k,) within the bounds `least` and `most` (k,) for which A u is nearest to b.
 
     If several u are equally good, the u with the smallest norm is returned.

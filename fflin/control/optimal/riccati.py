@@ -88,7 +88,8 @@ class Riccati:
     def gain(self, P: Array) -> Array:
         """Return K (nu, nx), u = -K x."""
         factor, Y = self._factored(P)
-        return dtrtrs(factor, Y, lower=1, trans=1)[0]
+        K: Array = dtrtrs(factor, Y, lower=1, trans=1)[0]
+        return K
 
     def trial(self, P: Array) -> _Trial:
         """Return P, its residual matrix (`defect`), and the relative norm of this matrix."""
@@ -378,4 +379,5 @@ def second_order_loop(
 
 
 def _lower(factor: Array, right: Array) -> Array:
-    return dtrtrs(factor, right, lower=1)[0]
+    solution: Array = dtrtrs(factor, right, lower=1)[0]
+    return solution
