@@ -360,7 +360,8 @@ def _root(W: Array) -> Array:
     size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
-    return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    return root
 
 
 def _reached(

@@ -111,7 +111,7 @@ class SecondOrder:
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
                 return False
         drag = np.linalg.eigvalsh(self.D.values / units)
-        return min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
+        return bool(min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max())
 
     @cached_property
     def poles(self) -> tuple[Values, ranks.Margin]:

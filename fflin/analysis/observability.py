@@ -232,7 +232,8 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     if duration is None:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        return solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+        W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+        return W
     if not dt:
         return held_cost(A.T, Q, duration)
     steps = round(duration / dt)

@@ -219,7 +219,8 @@ def unit_columns(matrix: Array) -> Array:
     """Scale columns to unit length; omit columns that are rounding errors of the largest column."""
     sizes = np.linalg.norm(matrix, axis=0)
     real = sizes > 1e2 * EPS * sizes.max(initial=0.0)
-    return matrix[:, real] / sizes[real]
+    scaled: Array = matrix[:, real] / sizes[real]
+    return scaled
 
 
 def echelon(

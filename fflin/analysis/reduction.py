@@ -12,7 +12,7 @@ from fflin.analysis import mechanics
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import input_keys
-from fflin.base.validation import Array, Indices, frozen
+from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.files import given
@@ -357,7 +357,8 @@ def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> Li
 def outputs_of(lin: LinearModel, S: Array) -> Array:
     """Return the selection matrix (k, ny) of the outputs that depend only on the states S x."""
     others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
-    return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
+    kept: Mask = others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)
+    return np.eye(len(lin.C))[kept]
 
 
 def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]:

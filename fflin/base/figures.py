@@ -12,9 +12,9 @@ from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_atomically
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.artist import Artist as Artist
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
 else:
     # Matplotlib is imported only when a figure is drawn.
     Artist = Axes = Figure = object

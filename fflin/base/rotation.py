@@ -18,7 +18,8 @@ _CROSS[[5, 6, 1], [0, 1, 2]] = -1.0
 def skew(a: Array) -> Array:
     """Return the cross-product matrices [a]x (..., 3, 3) of vectors, with ``[a]x b = a x b``."""
     if a.ndim == 1:
-        return _CROSS.dot(a).reshape(3, 3)
+        matrix: Array = _CROSS.dot(a).reshape(3, 3)
+        return matrix
     return (a @ _CROSS.T).reshape(*a.shape, 3)
 
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import pinocchio as pin
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike as ArrayLike
+    from numpy.typing import NDArray
 
     Array = NDArray[np.floating[Any]]
     Complex = NDArray[np.complexfloating[Any]]

@@ -24,7 +24,7 @@ from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array, Indices, Mask
-    from fflin.dynamics.state import Frame
+    from fflin.dynamics.coordinates import Frame
     from fflin.robot.robot import Robot
 
 # Identity placement of the free-flyer joint in Pinocchio's universe frame: position, then
@@ -385,7 +385,7 @@ def _apart(at: Array, turning: bool, value: float) -> Array:
     If `turning` is true, the joint is continuous, and the distance is the shorter arc between the
     two angles.
     """
-    distance = at - value
+    distance: Array = at - value
     if turning:
         distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
     return np.abs(distance)

@@ -100,7 +100,8 @@ class Execution(ExitStack):
                 return count
         client = getattr(self.executor, "_client", None)
         if client is not None and hasattr(client, "nthreads"):
-            return max(1, sum(client.nthreads().values()))
+            threads: int = sum(client.nthreads().values())
+            return max(1, threads)
         return _UNKNOWN_WORKERS
 
 

@@ -18,7 +18,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FflinWarning, located
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, ArrayLike, Indices, frozen, vector
+from fflin.base.validation import Array, ArrayLike, Indices, Mask, frozen, vector
 from fflin.batch.configurations import Configurations, checked_points, checked_rows
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
@@ -33,8 +33,8 @@ from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.dynamics.state import Frame
-    from fflin.kernel.derivatives import Mask, RowAccelerations
+    from fflin.dynamics.coordinates import Frame
+    from fflin.kernel.derivatives import RowAccelerations
 
 # Limits of the default chunk size: bytes (configurations plus results), and number of rows. A chunk
 # must take much longer to compute than to send, and several chunks must fit into memory.

@@ -185,7 +185,8 @@ class Campaign(FrozenArrays):
     @property
     def stopped(self) -> Mask:
         """Whether each run (N,) was stopped before its end."""
-        return self.stop != 0.0
+        stopped: Mask = self.stop != 0.0
+        return stopped
 
     @property
     def about(self) -> str:

@@ -21,9 +21,10 @@ from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
 from fflin.control.tracking import TrajectoryOutputFeedback
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
-from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree, batch_tree
+from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
@@ -224,7 +225,8 @@ class Dispersions:
         # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
         if isinstance(column.inverse, partial):  # a fast function from the module `spreads`
-            return column.inverse(uniform)
+            values: Array = column.inverse(uniform)
+            return values
         kept = self._kept.get((column.name, block), np.empty(0))
         if len(kept) < count:
             try:
@@ -333,7 +335,8 @@ class Dispersions:
     def delays(self, drawn: Array) -> Array:
         """Return the total delays (N,) of the inputs, in integration steps."""
         late = self._of("delay", drawn)[:, 0] / self._times.dt
-        return np.maximum(0.0, np.rint(self._times.delay + late))
+        steps: Array = np.maximum(0.0, np.rint(self._times.delay + late))
+        return steps
 
     def in_lanes(self, drawn: Array) -> dict[str, Array]:
         """Return the arrays of the compiled loop that differ between runs, one row per run."""

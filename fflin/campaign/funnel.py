@@ -155,7 +155,8 @@ class Funnel(Design):
     def attitude(self) -> Array:
         """Half-axes (m, 3) of the ellipsoids in base attitude [deg]."""
         sines = np.linalg.svd(self._roots[:, :3], compute_uv=False)
-        return np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
+        angles: Array = np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
+        return angles
 
     @cached_property
     def position(self) -> Array:
@@ -197,7 +198,7 @@ class Funnel(Design):
 
     def root(self, t: float) -> Array:
         """Return W (nx, nx), which maps norm(z) <= 1 to the ellipsoid e = W z at time t."""
-        size = np.sqrt(self.level(t))
+        size: float = np.sqrt(self.level(t))
         return size * ellipsoid_axes(self.cost(t))
 
     def contains(

@@ -176,7 +176,8 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
                 f"the distribution of '{name}' has no median; give a frozen distribution of "
                 "scipy.stats"
             )
-        return spread.ppf
+        inverse: Inverse = spread.ppf
+        return inverse
     if isinstance(spread, tuple):
         bounds = [number(f"'{name}'", each) for each in spread]
         if len(bounds) != 2 or bounds[0] > bounds[1]:
@@ -200,7 +201,8 @@ def _uniform(least: float, largest: float, u: Array) -> Array:
 
 
 def _choice(values: Array, u: Array) -> Array:
-    return values[(u * len(values)).astype(int)]
+    chosen: Array = values[(u * len(values)).astype(int)]
+    return chosen
 
 
 def _normal(deviation: float, u: Array) -> Array:

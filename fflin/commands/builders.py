@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.base.validation import Array
-    from fflin.dynamics.state import Frame
+    from fflin.dynamics.coordinates import Frame
 
 T = TypeVar("T")
 

@@ -116,7 +116,8 @@ def _damping(lin: LinearModel) -> Array:
     whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
     damped = bool(rates.sum() > 1e-9 * whole)
     forces = lin.M @ modes
-    return (forces * rates.clip(0.0)) @ forces.T * damped
+    B: Array = (forces * rates.clip(0.0)) @ forces.T * damped
+    return B
 
 
 def _of_inertia(
@@ -209,7 +210,7 @@ def _on_velocities(
         part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
         values, directions = np.linalg.eigh((modes.T * part) @ modes - own)
         rows = directions.T @ back
-        weight = (rows.T * values.clip(0.0)) @ rows / w**4
+        weight: Array = (rows.T * values.clip(0.0)) @ rows / w**4
         return 0.5 * (weight + weight.T)
 
     return at
@@ -254,7 +255,9 @@ def _fastest(
     time = np.geomspace(first, 3.0, 60)[:, None]
     fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
     moving = (rates**2 * (slow - fast) / root).real
-    return _largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
+    use = _largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names)
+    largest: Array = use.max(axis=0)
+    return largest
 
 
 def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:

@@ -196,7 +196,7 @@ class _Made(NamedTuple):
     @property
     def reached(self) -> bool:
         """Whether the motion ends at the goal and is within the limits at the knots."""
-        return max(self.missed.max(), self.at_knots.max()) <= _REACHED
+        return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
 
 
 def _least(search: Search) -> _Made:

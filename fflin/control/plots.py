@@ -297,7 +297,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
 
     def response(w: float) -> Values:
         s = np.exp(1j * w * dt) if dt else 1j * w
-        T = np.einsum("ij,ji->i", K, np.linalg.solve(s * np.eye(len(F)) - F, B))
+        T: Values = np.einsum("ij,ji->i", K, np.linalg.solve(s * np.eye(len(F)) - F, B))
         with np.errstate(divide="ignore", invalid="ignore"):
             return T / (1.0 - T)
 

@@ -12,9 +12,9 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import readout
+from fflin.dynamics.coordinates import Frame, readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
-from fflin.dynamics.state import Actuation, Frame, StateMap, selection
+from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.model import LinearModel
@@ -351,7 +351,7 @@ def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
 
 def bound(policy: object, robot: Robot) -> Policy:
     """Return a policy bound to a robot, or raise `InputError` if the object is not a policy."""
-    result = policy.bind(robot) if hasattr(policy, "bind") else policy
+    result: object = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
             f"policy has type {type(policy).__name__}, expected policy(t, q, v) -> u, such as "

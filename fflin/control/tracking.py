@@ -15,9 +15,9 @@ from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider
 from fflin.control.tvlqr import FilterSchedule, GainSchedule, resting_end, steady_regulator
-from fflin.dynamics.coordinates import moved_by, moving_error
+from fflin.dynamics.coordinates import Frame, moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, require_turns, signals_of
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
@@ -196,7 +196,8 @@ class TrajectoryFeedback(Feedback):
 
         def policy(t: float, q: Array, v: Array) -> Array:
             u, e = deviation(t, q, v)
-            return u - self.gain(t).dot(e)
+            command: Array = u - self.gain(t).dot(e)
+            return command
 
         return policy
 

@@ -135,19 +135,19 @@ class GainSchedule(Schedule):
         """
         k = self.interval(t)
         if self.dt:
-            return self.K[k]
+            K: Array = self.K[k]
+            return K
         x = t - self.starts[k]
         square = x * x
         fourth = square * square
         powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
-        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
+        K = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
+        return K
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
         k = self.interval(t)
-        if self.dt:
-            return self.P[k]
-        P: Array = self._cubics(t)
+        P: Array = self.P[k] if self.dt else self._cubics(t)
         return P
 
     @cached_property
@@ -233,11 +233,13 @@ class FilterSchedule(Schedule):
 
     def gain(self, t: float) -> Array:
         """Return L (nx, ny) of the most recent sample at time t."""
-        return self.L[self.interval(t)]
+        L: Array = self.L[self.interval(t)]
+        return L
 
     def covariance(self, t: float) -> Array:
         """Return P (nx, nx) of the most recent sample at time t."""
-        return self.P[self.interval(t)]
+        P: Array = self.P[self.interval(t)]
+        return P
 
 
 @in_one_thread

@@ -66,7 +66,8 @@ class Aba:
         columns = self.actuation.columns(data, q)
         bias = state.forces(pin.nonLinearEffects(self._model, data, q, v))
         forces = np.abs(columns) @ np.abs(u) + np.abs(bias) + np.abs(self._passive_force(q, v))
-        return np.abs(np.linalg.inv(M)) @ forces
+        total: Array = np.abs(np.linalg.inv(M)) @ forces
+        return total
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of dnu/dt with respect to the tangent of q, to nu and to u.
@@ -143,7 +144,8 @@ class Aba:
     ) -> Array:
         state = self.state
         if not state.robot.followers:
-            return pin.aba(model, self._data, q, v, state.lift(forces), external)
+            rates: Array = pin.aba(model, self._data, q, v, state.lift(forces), external)
+            return rates
         # Mimic joints: solve S^T M S nudot = S^T (tau - b) with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)

@@ -288,7 +288,8 @@ def readout(
             z_linear[:] = R.dot(v[:3])
             if turned_angular:
                 z_angular[:] = R.dot(v[3:6])
-        return gains.dot(z)
+        u: Array = gains.dot(z)
+        return u
 
     return law
 

@@ -192,7 +192,7 @@ def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))
         step = exponential[..., n:, n:]
-        total = step.mT @ exponential[..., :n, n:]
+        total: Array = step.mT @ exponential[..., :n, n:]
         for _ in range(doublings):
             total = total + step.mT @ total @ step
             step = step @ step

@@ -59,7 +59,7 @@ class Inertia:
         self._slides = [*map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))]
         # M does not depend on the base's pose. Pinocchio works in world axes, and would lose digits
         # if the base were far away. So the base is placed at the origin.
-        self._still = pin.neutral(robot.model)
+        self._still: Array = pin.neutral(robot.model)
         self.least_coupling = 0.999 * (6 + robot.n)
 
     def centred(self, q: Array) -> Array:

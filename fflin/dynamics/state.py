@@ -127,7 +127,8 @@ class StateMap:
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
-        self._gravity, self._pulled = root.T @ np.array(robot.gravity), any(robot.gravity)
+        self._gravity: Array = root.T @ np.array(robot.gravity)
+        self._pulled = any(robot.gravity)
         # Whether gravity or the motion in orbit accelerates the base's origin relative to the
         # reference.
         self.falls = self._pulled or robot.orbit is not None
@@ -367,7 +368,7 @@ class StateMap:
 
     def joints_apart(self, before: Array, q: Array) -> Array:
         """Return the change of q_m (n,) between the valid configurations `before` and `q` (nq,)."""
-        apart = (q.take(self._idx_q) - before.take(self._idx_q)) / self._scale[6:]
+        apart: Array = (q.take(self._idx_q) - before.take(self._idx_q)) / self._scale[6:]
         if self._cos.size:
             s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))
             apart[self.unbounded] = np.arctan2(s * c_0 - c * s_0, c * c_0 + s * s_0)
@@ -375,7 +376,8 @@ class StateMap:
 
     def positions(self, q: Array) -> Array:
         """Return the base positions r_b (.., 3) [m] at valid configurations (.., nq)."""
-        return self._position + q[..., :3] @ self._rotation.T
+        positions: Array = self._position + q[..., :3] @ self._rotation.T
+        return positions
 
 
 class Actuation:

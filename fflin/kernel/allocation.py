@@ -20,7 +20,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
-from fflin.kernel.vectors import called, load, root, store
+from fflin.kernel.vectors import Entries, called, load, root, store
 
 # `solve` minimises the squared error of the scaled force plus LEAST^2 times the sum of the squared
 # scaled inputs x. If several x produce the same force, the second term selects the x with the
@@ -142,7 +142,7 @@ def write_scaled(source: Array, lane: int, factor: float, target: Array) -> None
     target[:] = factor * source[: len(target)]
 
 
-def least_squares(least, most, size):
+def least_squares(least: Entries, most: Entries, size: int) -> LeastSquares:
     """Return a `LeastSquares` problem with the bounds `least` and `most` (k,), for forces (size,).
 
     All other arrays contain zeros, and have one axis.
@@ -350,7 +350,7 @@ def _steepest(problem, size):
     return found
 
 
-def nearest(A, b, least, most):
+def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     """Return the u (k,) within the bounds `least` and `most` (k,) for which A u is nearest to b.
 
     If several u are equally good, the u with the smallest norm is returned.

@@ -18,7 +18,7 @@ from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
 from fflin.kernel.tree import FLAGS, INDICES, LANED, REALS, TREE, Struct
-from fflin.kernel.vectors import angle, called, chosen, load, store
+from fflin.kernel.vectors import Entries, angle, called, chosen, load, store
 
 
 class Mechanics(
@@ -94,7 +94,9 @@ def joint_position(robot, q, joint):
     return value / load(robot.scale, joint)
 
 
-def apply_faults(faults, triads, t, u, given):
+def apply_faults(
+    faults: ActuatorFaults, triads: list[int], t: float, u: Entries, given: Entries
+) -> None:
     """Write to `given` the inputs that the actuators produce for a command u at a time t [s]."""
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)

@@ -15,7 +15,7 @@ from fflin.kernel.allocation import allocate
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import angle, below, chosen, load, root, store, whole
+from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, store, whole
 
 
 class Wheels(
@@ -73,14 +73,14 @@ def clipped(value, low, high):
     return chosen(high, value, high, value)
 
 
-def limit(channel, u):
+def limit(channel: Channel, u: Entries) -> None:
     """Saturate the commands u at the limits of the channel."""
     for index in range(len(channel.low)):
         value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
         store(u, index, value)
 
 
-def is_asked(channel, step):
+def is_asked(channel: Channel, step: int) -> bool:
     """Return whether the policy is evaluated in a step.
 
     Continuous commands are evaluated in every step, sampled commands at the start of each sample.
@@ -88,7 +88,7 @@ def is_asked(channel, step):
     return channel.sample == 0 or step % channel.sample == 0
 
 
-def transmit(channel, step, nu, u):
+def transmit(channel: Channel, step: int, nu: Entries, u: Entries) -> None:
     """Replace the command u by the inputs that act in a step.
 
     The command is read only in steps in which the policy is evaluated (`is_asked`). nu contains the
@@ -239,7 +239,7 @@ def _combine(shares, row, rates, out):
         store(out, index, total)
 
 
-def goes_on(stop, origin, q, rates):
+def goes_on(stop: StopConditions, origin: Entries, q: Entries, rates: Entries) -> bool:
     """Return True if all velocities are below their limits and the base is within the chart.
 
     `rates` are the velocities. If `stop.sign` is 0, every attitude is allowed. In compiled code,

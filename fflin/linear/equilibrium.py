@@ -11,9 +11,9 @@ import pinocchio as pin
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid, signals
 from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance
-from fflin.dynamics.coordinates import ORBITAL, forces_of, frame_of
+from fflin.dynamics.coordinates import ORBITAL, Frame, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
-from fflin.dynamics.state import Actuation, Frame, StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT

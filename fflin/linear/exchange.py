@@ -12,8 +12,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, Vector, instance, number, shaped, vector
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, StateSpace

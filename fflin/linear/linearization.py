@@ -12,10 +12,10 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.coordinates import Chart, Standing, refuse_orbit
+from fflin.dynamics.coordinates import Chart, Frame, Standing, refuse_orbit
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
-from fflin.dynamics.state import Actuation, Frame, StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.check import certify, inertia_matrix
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scipy import signal
 
     from fflin import ToolModel
-    from fflin.dynamics.state import Frame
+    from fflin.dynamics.coordinates import Frame
     from fflin.robot.robot import Robot
 
 ControlSystem: TypeAlias = "control.StateSpace"

@@ -153,10 +153,12 @@ class ToolCoordinates:
     def _rotation(self, attitude: Array) -> Array:
         """Return the rotation matrix (3, 3) of an attitude that is given as in the tool's q."""
         if self.convention.stored == "euler":
-            return pin.rpy.rpyToMatrix(*attitude)
+            R: Array = pin.rpy.rpyToMatrix(*attitude)
+            return R
         if self.convention.stored == "matrix":
             R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
-            return placement("R0 (q[:9] by columns)", R0).rotation
+            R = placement("R0 (q[:9] by columns)", R0).rotation
+            return R
         length = float(np.linalg.norm(attitude))
         if abs(length - 1.0) > NORM_TOLERANCE:
             raise InputError(
@@ -194,7 +196,8 @@ class ToolCoordinates:
         is constant in the world, so its components in base axes depend on the rotation. The
         derivative of a vector that the tool gives in base axes is zero.
         """
-        return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
+        derivative: Array = self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
+        return derivative
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
         """Return the `Jacobians` at a point.

@@ -191,7 +191,8 @@ class Trajectory(Design):
         residual of a knot is the larger error of its two adjacent intervals.
         """
         found = self.interval_errors
-        return np.maximum(np.append(found, 0.0), np.append(0.0, found))
+        larger: Array = np.maximum(np.append(found, 0.0), np.append(0.0, found))
+        return larger
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
         """Return q (nq,), v (nv,), and u (nu,) in base axes, at time t [s].

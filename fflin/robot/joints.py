@@ -186,7 +186,7 @@ class Coordinates:
 
     def neutral(self) -> Array:
         """Return the neutral configuration (nq,), in which mimic joints follow their leaders."""
-        q = pin.neutral(self.model)
+        q: Array = pin.neutral(self.model)
         self.follow(q)
         return q
 

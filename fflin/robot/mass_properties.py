@@ -260,7 +260,8 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
     center = np.concatenate((body.lever + com @ piece.frame.rotation.T, np.ones((len(com), 1))), 1)
     added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
-    return after + added - body.toPseudoInertia().toMatrix()
+    changes: Array = after + added - body.toPseudoInertia().toMatrix()
+    return changes
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:

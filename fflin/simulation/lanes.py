@@ -363,7 +363,7 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
     """Return the law of an uncontrolled robot; the law computes states and errors only."""
-    law = empty(policies.LAW)
+    law: policies.Law = empty(policies.LAW)
     q, nu = np.zeros(state.robot.nq), np.zeros(state.nx // 2)
     point = law.path.point._replace(q=q, nu=nu, u=np.zeros(len(u)))
     return law._replace(

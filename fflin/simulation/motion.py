@@ -266,7 +266,7 @@ class Motion(Design):
                 "simulate"
             )
         first = parts[0]
-        whole = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
+        whole: Motion = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
         robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
         for part in parts[1:]:
             if isinstance(part, Impact):

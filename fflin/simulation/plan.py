@@ -22,9 +22,9 @@ from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
 from fflin.control.tracking import followed, largest_rate, tracking_of
 from fflin.dynamics import points
-from fflin.dynamics.coordinates import ORBITAL, refuse_orbit
+from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
-from fflin.dynamics.state import Frame, StateMap, selection
+from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.robot import Robot

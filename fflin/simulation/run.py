@@ -203,7 +203,8 @@ class Conserved:
     def center(self, t: float) -> Array:
         """Return the centre of mass (3,) at time t, relative to the fixed point."""
         self._time[1] = t
-        return self._line.dot(self._time)
+        center: Array = self._line.dot(self._time)
+        return center
 
     def impose(self, t: float, q: Array, v: Array) -> None:
         """Correct the base position in `q` and the base velocity in `v`.

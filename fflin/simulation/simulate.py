@@ -17,8 +17,7 @@ from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
 from fflin.control.policies import Policy, StateFeedback, feedback_of
 from fflin.control.tvlqr import GainSchedule
-from fflin.dynamics.coordinates import state_history
-from fflin.dynamics.state import Frame
+from fflin.dynamics.coordinates import Frame, state_history
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import limits_of

@@ -145,8 +145,8 @@ class ModelDerivatives:
             change_bodies(other.model, self.robot.model, one, size)
             moved = AccelerationDerivatives(*(a + size * b for a, b in zip(now, by, strict=True)))
             made = output_equations(sensing, actuation, data, self._chart, moved, lin.x0, point)
-            seen = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
-            total = pin.computeTotalMass(other.model)
+            seen: Array = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
+            total: float = pin.computeTotalMass(other.model)
             for joint in one.bodies:
                 other.model.inertias[joint] = self.robot.model.inertias[joint]
             return total * seen

@@ -209,7 +209,7 @@ class Loops:
 
         def above(rows: Array, bound: float) -> Mask:
             F, B = self.matrices(rows)
-            unstable = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
+            unstable: Mask = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)
             _, crossed = gain_crossings(F, B * of.scale, of.C, of.D, limit)
             return unstable | crossed.any(axis=-1)

@@ -256,7 +256,9 @@ class _Socket(_Guarded, WebSocketHandler):
 
     def send(self, content: bytes | str) -> asyncio.Future[None] | None:
         try:
-            return self.write_message(content, binary=isinstance(content, bytes))
+            binary = isinstance(content, bytes)
+            sent: asyncio.Future[None] = self.write_message(content, binary=binary)
+            return sent
         except WebSocketClosedError:
             return None
 

@@ -17,13 +17,13 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
-from fflin.dynamics.coordinates import frame_of
+from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
-from fflin.dynamics.state import Actuation, Frame, StateMap
+from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.joints import find_frame
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve

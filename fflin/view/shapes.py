@@ -273,7 +273,8 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
 
 
 def _radius(mass: float) -> float:
-    return (0.75 * mass / (math.pi * _DENSITY)) ** (1.0 / 3.0)
+    radius: float = (0.75 * mass / (math.pi * _DENSITY)) ** (1.0 / 3.0)
+    return radius
 
 
 Color = tuple[float, float, float, float]

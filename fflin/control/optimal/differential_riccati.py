@@ -27,7 +27,8 @@ def rate(coefficients: Array, P: Array) -> Array:
     """Return dP/dt = P S P - A' P - P A - Q, with the coefficients A, S = B R^-1 B' and Q."""
     A, S, Q = coefficients
     drift = P @ A
-    return P @ S @ P - drift - drift.T - Q
+    slope: Array = P @ S @ P - drift - drift.T - Q
+    return slope
 
 
 def joined(early: Array, late: Array) -> Array:

@@ -244,7 +244,8 @@ def excess(room: Array) -> Array:
 
     `room` (2, ..) contains the lower and the upper limits, both minus the values.
     """
-    return np.maximum(np.maximum(room[0], -room[1]), 0.0)
+    beyond: Array = np.maximum(np.maximum(room[0], -room[1]), 0.0)
+    return beyond
 
 
 # Absolute and relative tolerance of the optimality conditions of the scaled quadratic program.

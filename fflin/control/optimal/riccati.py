@@ -88,7 +88,8 @@ class Riccati:
     def gain(self, P: Array) -> Array:
         """Return the gain K (nu, nx) of the feedback u = -K x, from P (nx, nx)."""
         factor, Y = self._factored(P)
-        return dtrtrs(factor, Y, lower=1, trans=1)[0]
+        K: Array = dtrtrs(factor, Y, lower=1, trans=1)[0]
+        return K
 
     def trial(self, P: Array) -> _Trial:
         """Return P, its residual matrix (`defect`), and the relative norm of this matrix."""
@@ -384,4 +385,5 @@ def second_order_loop(
 
 
 def _lower(factor: Array, right: Array) -> Array:
-    return dtrtrs(factor, right, lower=1)[0]
+    solution: Array = dtrtrs(factor, right, lower=1)[0]
+    return solution
