@@ -90,7 +90,9 @@ def reading(path: Path, what: str) -> Iterator[None]:
 def require_finite(record: Mapping[str, object]) -> None:
     """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
-        if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
+        if isinstance(value, dict):
+            require_finite({f"{name} of {key}": each for name, each in value.items()})
+        elif isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
             raise InputError(f"{key} is not finite; only finite values can be saved")
 
 

@@ -27,10 +27,6 @@ _BLOCK = 2048
 # depend on the chunk in which it is read.
 _DRAWN = 4096
 
-# Range of a revolute joint without limits [rad]. Limits that include -2 pi to 2 pi count as no
-# limits.
-_TURN = (-math.pi, math.pi)
-
 
 @dataclass(frozen=True, eq=False)
 class Grid:
@@ -243,8 +239,11 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
         return low, high
     low, high = travel_of(robot.model, joint)
     if not joint.prismatic:
-        low, high = max(low, 2 * _TURN[0]), min(high, 2 * _TURN[1])
-        return (low, high) if low <= high and high - low < 4 * math.pi else _TURN
+        if high - low < 4.0 * math.pi:
+            return low, high
+        # Two revolutions or more: choose the revolution within the limits that is nearest to zero.
+        middle = min(max(0.0, low + math.pi), high - math.pi)
+        return middle - math.pi, middle + math.pi
     if not (low <= high and abs(low) < 1e6 and abs(high) < 1e6):
         raise InputError(
             f"prismatic joint '{joint.name}' has no limits to draw from; give its range in ranges="

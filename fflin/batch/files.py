@@ -177,6 +177,7 @@ class MemoryStore:
     ) -> None:
         # The arrays in `given` are not copied.
         self.count, self.chunk, self.arrays = count, chunk, dict(given or {})
+        self._finished = set[int]()  # first rows of the finished chunks
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
                 raise MemoryError
@@ -190,8 +191,8 @@ class MemoryStore:
             ) from None
 
     def finished(self, start: int, stop: int) -> bool:
-        """Return False, because memory contains no chunks of an earlier call."""
-        return False
+        """Return whether a chunk has been written."""
+        return start in self._finished
 
     def read(self, stop: int) -> dict[str, Array]:
         """Return the rows before row `stop`."""
@@ -206,6 +207,7 @@ class MemoryStore:
         for key, rows in self.view(start, stop, self.arrays).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
+        self._finished.add(start)
 
     def complete(self) -> dict[str, Array]:
         """Return all arrays."""

@@ -244,9 +244,10 @@ def _failure(
     made: Callable[[dict[str, Array]], object],
 ) -> SweepError:
     """Return a `SweepError` that lists the failed chunks; see `run_chunks`."""
-    kept = np.ones(store.count, dtype=bool)
-    for start, stop, _ in failed:
-        kept[start:stop] = False
+    kept = np.zeros(store.count, dtype=bool)
+    for start in range(0, store.count, store.chunk):
+        stop = start + store.chunk
+        kept[start:stop] = store.finished(start, min(stop, store.count))
     numbers = listed(f"{start} to {stop - 1}" for start, stop, _ in failed)
     message = (
         f"{len(failed)} of {-(-store.count // store.chunk)} chunks "

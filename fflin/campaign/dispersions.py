@@ -19,7 +19,7 @@ from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider
+from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider, feedback_of
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
@@ -397,7 +397,7 @@ class Dispersions:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if isinstance(policy, Allocation):  # the allocation must use the nominal directions
                 nominal = bound(policy, plant.robot)
-                policy = _Bound(lambda _: nominal)
+                policy = _Bound(lambda _: nominal, feedback_of(policy)[0])
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
         own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))

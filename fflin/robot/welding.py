@@ -132,8 +132,11 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
-    # If `other` was not read from a URDF, its base becomes a link with the name `prefix`.
-    if not other.links:
+    # If `other` was not read from a URDF, its base becomes a link with the name `prefix`. A robot
+    # that was not read from a URDF has no links, so that a link would stand for a whole body.
+    if not robot.links:
+        both["links"] = {}
+    elif not other.links:
         both["links"][prefix] = link_mass(other.model.inertias[ROOT])
     identity = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     bare = replace(

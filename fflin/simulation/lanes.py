@@ -334,7 +334,7 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
         reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,
         pushed=not plant.isolated(driven=plan.law is not None),
-        stop=stop._replace(squares=state.velocities(stop.squares)),
+        stop=stop._replace(squares=state.velocities(np.sqrt(stop.squares)) ** 2),
         point=forward.Point(
             q=plan.q, nu=state.velocities(plan.v), u=u, pushing=u, wrench=np.zeros(6)
         ),

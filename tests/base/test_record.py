@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.record import CODECS, content_digest, read_record
+from fflin.base.record import CODECS, content_digest, read_record, write_record
 from fflin.base.validation import NOT_VERIFIED
 from fflin.base.writing import RECORDS
 from tests.support.messages import any_wording
@@ -210,6 +210,14 @@ def test_the_digest_is_what_the_documents_say(tmp_path):
     inner = b"".join(hashlib.sha256(part).digest() for part in parts)
     expected = hashlib.sha256(f"a <f8 {large.shape}\n".encode() + inner).hexdigest()
     assert content_digest({"a": large}) == expected
+
+
+@pytest.mark.parametrize("ending", RECORDS)
+def test_a_number_of_a_group_that_is_not_finite_is_refused(ending, tmp_path):
+    path = tmp_path / f"x{ending}"
+    with pytest.raises(fflin.InputError, match="second of figures is not finite"):
+        write_record(path, {"figures": {"first": 1.0, "second": np.inf}}, checksummed=True)
+    assert not path.exists()
 
 
 def test_matlab_files_of_others_are_read(tmp_path):

@@ -101,6 +101,34 @@ def test_in_memory_the_error_has_what_is_made_of_the_rest():
     assert np.array_equal(error.batch, np.r_[0:16, 24:50])
 
 
+class CountedWalks(Walks):
+    """Walks that count the chunks that are computed."""
+
+    def __init__(self, endless=-1):
+        super().__init__(endless)
+        self.starts = []
+
+    def run(self, rows, start, out):
+        self.starts.append(start)
+        return super().run(rows, start, out)[:0]
+
+
+def test_a_second_call_in_memory_computes_only_what_is_missing(expected):
+    job, store = CountedWalks(), MemoryStore(COUNT, CHUNK, STORED)
+    run_chunks(job, seeds, store, ALONE, upto=20)
+    assert job.starts == [0, 8, 16]
+    run_chunks(job, seeds, store, ALONE)
+    assert job.starts == [0, 8, 16, 24, 32, 40, 48]
+    assert np.array_equal(store.arrays["walk"], expected["walk"])
+
+
+def test_the_error_of_a_part_has_no_rows_that_were_not_computed():
+    job, store = CountedWalks(endless=4), MemoryStore(COUNT, CHUNK, STORED)
+    with any_wording(), pytest.raises(fflin.SweepError) as caught:
+        run_chunks(job, seeds, store, ALONE, made=lambda rows: rows["seed"], upto=20)
+    assert np.array_equal(caught.value.batch, np.r_[8:24])
+
+
 # The worker sends the length of a result, and dies before it sends the result.
 DYING = """
     import os, struct, sys

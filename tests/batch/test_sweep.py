@@ -158,6 +158,26 @@ def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are
     assert not np.array_equal(fflin.random_configurations(robot, 9, seed=8).rows(0, 9), q[:9])
 
 
+@pytest.mark.parametrize(
+    "limits, drawn_from",
+    [
+        ((7.0, 9.0), (7.0, 9.0)),
+        ((-7.0, 5.0), (-7.0, 5.0)),
+        ((-2.0 * np.pi, 2.0 * np.pi), (-np.pi, np.pi)),
+        ((1.0, 100.0), (1.0, 1.0 + 2.0 * np.pi)),
+        ((-100.0, -1.0), (-1.0 - 2.0 * np.pi, -1.0)),
+    ],
+)
+def test_angles_are_drawn_within_the_limits_also_far_from_zero(limits, drawn_from, robots):
+    robot = robots["servicer_7dof"]
+    model, at = robot.model.copy(), robot.joint("joint_1").idx_q
+    model.lowerPositionLimit[at], model.upperPositionLimit[at] = limits
+    drawn = fflin.random_configurations(fflin.from_model(model), 2000, seed=1)
+    q, (low, high) = drawn.rows(0, 2000)[:, at], drawn_from
+    assert low <= q.min() < low + 0.02 * (high - low)
+    assert high - 0.02 * (high - low) < q.max() <= high
+
+
 def test_mimic_joints_follow_on_a_grid():
     robot = fflin.load("panda")
     batch = fflin.sweep(robot, fflin.grid(robot, {"panda_finger_joint1": [0.0, 0.01, 0.04]}))

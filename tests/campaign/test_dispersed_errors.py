@@ -72,6 +72,23 @@ def test_lanes_turn_inputs_of_all_kinds():
         both(robot, fflin.StateFeedback(lin, K), given | rates, duration=1.0)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_run_with_misaligned_thrusters_ends_where_the_chart_ends(engine):
+    """The allocation keeps the model of its policy, and with it the chart."""
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    given = fflin.load_inputs("cubesat")
+    robot = fflin.load("cubesat", inputs=[x for x in given if isinstance(x, fflin.Thruster)])
+    design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    lin = fflin.linearize(design)
+    policy = fflin.Allocation(fflin.StateFeedback(lin, np.zeros((6, 12))), design)
+    x0 = np.zeros(12)
+    x0[0], x0[6] = np.sin(np.radians(85.0)), 0.5  # half of 170 deg; beyond 180 deg after 0.35 s
+    case = {"runs": 2, "duration": 1.0, "dt": 0.05, "x0": x0, "engine": engine}
+    campaign = fflin.monte_carlo(robot, policy, {"thrust.misalignment": 0.01}, **case)
+    assert campaign.stopped.all()
+
+
 def test_a_direction_is_turned_about_two_axes_across_it():
     rng = np.random.default_rng(0)
     for direction in (*np.eye(3), *rng.normal(size=(3, 3))):

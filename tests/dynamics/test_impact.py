@@ -128,6 +128,22 @@ def test_what_was_caught_may_jam_too():
     assert len(shapes(left.robot)[0]) == len(shapes(caught.robot)[0])
 
 
+@pytest.mark.parametrize("payload", [pin.Inertia(5.0, np.zeros(3), np.eye(3)), "cubesat"])
+def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
+    """A model of other origin has no links, so the body that grasps keeps its own name."""
+    model = fflin.load("planar_detumble").model
+    robot = fflin.from_model(model)
+    held = fflin.load(payload) if isinstance(payload, str) else payload
+    caught = fflin.capture(robot, "hand", held).robot
+    bodies = zip(caught.model.names, caught.model.inertias, strict=True)
+    masses = {name: body.mass for name, body in bodies if body.mass}
+    found = {name: piece.mass for name, piece in caught.pieces.items()}
+    assert [*found] == ["base", *[*masses][1:]]
+    assert [*found.values()] == [*masses.values()]
+    heavier = caught.with_mass_properties({"joint_3": {"mass": 100.0}})
+    assert heavier.mass == pytest.approx(caught.mass + 100.0 - found["joint_3"])
+
+
 def test_a_joint_of_what_was_caught_keeps_the_spring_of_its_own_name():
     robot = fflin.load("ets_vii", stiffness=3.0)
     caught = fflin.capture(robot, "tool", robot.replace(stiffness=4.0))

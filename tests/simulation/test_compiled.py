@@ -267,6 +267,15 @@ def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, m
     assert len(calls) == (-(-100 // every) if memory == 1 else 1)
 
 
+def test_limits_of_modal_rates_are_scaled_like_the_rates():
+    robot = fflin.load("inspector_flexible.toml")
+    plan = Plan(SimulationOptions(robot=robot, policy=None, duration=0.2, dt=0.01))
+    stop = run.stop_conditions(plan)
+    limits = plan.plant.state.velocities(np.sqrt(stop.squares))
+    assert limits.min() < 0.5 * limits.max()
+    np.testing.assert_allclose(lanes.packed(plan, stop).stop.squares, limits**2, rtol=1e-15)
+
+
 def nothing(t, q, v):
     return np.zeros(9)
 
