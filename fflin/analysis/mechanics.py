@@ -198,7 +198,7 @@ def rates_of_positions(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """Conserved momenta, and the coordinates that remain if these are removed.
+    """Conserved momenta L1 x, their integrals L2 x, and the coordinates without both.
 
     A momentum is conserved if no input, spring or damper changes it.
     """
@@ -306,7 +306,11 @@ def grouped(names: tuple[str, ...]) -> list[str]:
 
 
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
-    """Format the terms of a linear combination with the largest ``abs(weights) * sizes``."""
+    """Format a linear combination of names.
+
+    At most `most` terms are written, those with the largest ``abs(weights) * sizes``. The other
+    terms are counted.
+    """
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
     largest = abs(weights[order[0]]) * sizes[order[0]]
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]

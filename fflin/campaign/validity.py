@@ -320,7 +320,11 @@ def _crossing(errors: Array) -> float:
 def _checked_displacement(
     lin: LinearModel, attitude: float, position: float, joint: float
 ) -> dict[str, float]:
-    """Return the checked displacement, with 0 for each quantity that has no state in the model."""
+    """Validate the largest displacements, and return them as {quantity: value}.
+
+    The quantities are "attitude", "position" and "joint". A quantity without a state in the model
+    gets the value 0.
+    """
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
     if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):

@@ -98,7 +98,7 @@ def info(arguments: Namespace) -> Report:
 
 
 def init(arguments: Namespace) -> Report:
-    """Write an initial robot.toml for a URDF, with all inputs, limits and unactuated joints.
+    """Write an initial robot.toml for a URDF, with unactuated joints and suggestions for inputs.
 
     example: fflin init my.urdf && fflin simulate my.toml
     """

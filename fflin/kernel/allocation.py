@@ -247,7 +247,9 @@ def solve(problem, size, lane):
 
 @called
 def _solve_scaled(problem, size, free, kept):
-    """Write the solution for the force `wanted` to x, starting from x and `state`.
+    """Find the inputs whose force is closest to `wanted`, and write them to x.
+
+    The iteration starts from the given x and `state`.
 
     `free` is the number of free inputs in `order`. The QR factors contain the columns of the first
     `kept` of these inputs. Return `free` and `kept` for the next call.

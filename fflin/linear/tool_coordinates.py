@@ -180,7 +180,7 @@ class ToolCoordinates:
         return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
-        """Return the matrix (6, 6) that rotates twists and wrenches from base to tool axes.
+        """Return the matrix (6, 6) that rotates twists and wrenches from base axes to the tool's.
 
         If `rates` is True, the angular block converts omega to the rates of the Euler angles.
         """

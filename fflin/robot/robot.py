@@ -242,8 +242,8 @@ class Robot(Coordinates):
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
         checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
-        # If `merged` is true, keep all entries that `fields` does not name. Otherwise, keep only
-        # the stiffness and damping of modes.
+        # A given table replaces the old table. If `merged` is true, the old entries of all joints
+        # that the new table does not name stay. Otherwise, only those of modes stay.
         modes = {joint.name for joint in robot.modes}
         for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
             if key in checked:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import filterfalse
 
 import numpy as np
 import pinocchio as pin
@@ -29,7 +30,7 @@ _TURN = 2.0 * math.pi  # [rad] one revolution
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter, such as "inertia.xx" of "arm", and the change of the robot per unit."""
+    """Parameter, such as "inertia.xx" of "arm", with the robot's derivatives with respect to it."""
 
     of: str
     part: str
@@ -66,13 +67,14 @@ class Parameters(dict[str, Parameter]):
     def find(self, key: str) -> list[str]:
         """Return the names of the parameters that match a name or pattern.
 
-        For a pattern, parameters of a body of several links are returned only if no link matches.
+        For a pattern, mass properties of a body of several links are returned only if no other
+        parameter matches.
         """
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
             body = max(bodies, key=len)
             key = self._link_of[body] + key[len(body) :]
-        names = [name for name in self if key == name or self[name].of not in self._sums]
+        names = [name for name in self if key == name or not self._of_several_links(name)]
         names = names if stands_for_any(key, names) else list(self)
         return [names[i] for i in matching("parameter", key, names)]
 
@@ -82,11 +84,14 @@ class Parameters(dict[str, Parameter]):
         The text `only` is an owner such as "arm", a part such as "mass", a name or a pattern. If
         `only` is None, all parameters match.
 
-        Parameters of a body of several links are left out if other parameters match.
+        Mass properties of a body of several links are left out if other parameters match.
         """
         found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
         found = found or self.find(str(only))
-        return [name for name in found if self[name].of not in self._sums] or found
+        return [*filterfalse(self._of_several_links, found)] or found
+
+    def _of_several_links(self, name: str) -> bool:
+        return self[name].of in self._sums and self[name].part in OF_PIECES
 
     def refusal(self, values: Mapping[str, float]) -> str:
         """Return why the robot with {parameter: value} is not realisable, or an empty text."""
@@ -134,10 +139,10 @@ class Parameters(dict[str, Parameter]):
         return found
 
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
-        """Return {joint: body} for all bodies with a changed link.
+        """Return {joint: inertia of its body} for all bodies with a changed link.
 
-        The joints are numbered as in the Pinocchio model without wheels. If a changed link is
-        not physically realisable, raise `InputError`.
+        The joints are numbered as in the Pinocchio model without wheels. If the inertia of a
+        changed link is not physically realisable, raise `InputError`.
         """
         model, bare = self._robot.model, self._robot._bare.model
         found: dict[int, Array] = {}

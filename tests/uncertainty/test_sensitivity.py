@@ -200,6 +200,15 @@ def test_links_that_are_fixed_to_each_other_have_parameters_of_their_own():
     assert locked.parameters["link_3.mass"].value == pytest.approx(9.5)
 
 
+def test_the_spring_of_a_joint_whose_body_has_several_links_matches_a_pattern_too():
+    robot = fflin.load("planar_detumble", stiffness=2.0, damping=0.1)
+    parameters = fflin.sensitivity(fflin.linearize(robot)).parameters
+    for part in ("stiffness", "damping"):
+        springs = [f"joint_{k}.{part}" for k in (1, 2, 3)]
+        assert parameters.find(f"*.{part}") == parameters.ranked(part) == springs
+    assert "joint_3.mass" not in parameters.find("*.mass")
+
+
 def test_a_robot_of_other_masses_is_known_by_its_bodies():
     robot = fflin.load("servicer_7dof").with_mass_properties({"link_3": {"mass": 20.0}})
     S = fflin.sensitivity(fflin.linearize(robot))

@@ -129,9 +129,9 @@ def solve(
 ) -> Solution:
     """Return the stabilising solution of an algebraic Riccati equation.
 
-    SciPy is used only if the half-size method fails or is inaccurate. If SciPy fails too, raise
-    `LinAlgError`. Newton's method refines the solution (D. L. Kleinman, IEEE Trans. Automatic
-    Control 13(1), 1968).
+    SciPy is used only if the half-size method fails or is inaccurate. The solution with the
+    smallest residual is returned. If both methods fail, raise `LinAlgError`. Newton's method
+    refines the solution (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -139,7 +139,8 @@ def solve(
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
-        # SciPy raises one of these errors if it cannot reorder the eigenvalues of the pencil.
+        # SciPy raises one of these errors if it finds no finite solution, if R is singular, or if
+        # it cannot reorder the eigenvalues of the pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
