@@ -33,7 +33,7 @@ import numpy as np
 
 from fflin.base import writing
 from fflin.base.errors import FileError, InputError, MissingPackageError
-from fflin.base.validation import Result
+from fflin.base.validation import NORM_TOLERANCE, Array, Result
 
 CHECKSUM = "sha256"
 
@@ -44,6 +44,7 @@ DAMAGED = f"its content does not match its {CHECKSUM}: the file was damaged or e
 
 _BLOCK = 2**22
 _LARGEST = 1e300
+_NO_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 # Matches the remains of a damaged header that contained a digest.
@@ -304,7 +305,21 @@ class Design(Result):
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
             values = {item.name: _value(item, record[item.name]) for item in _saved(cls)}
+            require_possible(values)
             return cls(**given, **values, verified=verified)
+
+
+def require_possible(values: Record) -> None:
+    """Raise `ValueError` if numbers, units or a pose from a file are impossible."""
+    for key, value in values.items():
+        if isinstance(value, float) and not (np.isfinite(value) and (value >= 0.0 or key != "dt")):
+            least = " of at least 0" * (key == "dt")
+            raise ValueError(f"{key} is {value:g}, expected a finite number{least}")
+        if key.endswith("_units") and len(value) != len(values[key.replace("units", "names")]):
+            raise ValueError(f"the number of its {key} differs from the number of names")
+    pose: Array = np.ravel(values.get("placement", _NO_POSE))
+    if pose.size != 7 or abs(float(np.linalg.norm(pose[3:])) - 1.0) > NORM_TOLERANCE:
+        raise ValueError("placement is not a position and a unit quaternion (7,)")
 
 
 def record_of(design: Design) -> Record:

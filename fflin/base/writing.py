@@ -38,7 +38,7 @@ def as_path(path: object) -> Path:
     if not isinstance(path, str | os.PathLike) or "\0" in str(path):
         raise InputError(f"{path!r} is not a path")
     if not str(path):
-        raise InputError("the path is empty; give the name of a file")
+        raise InputError("the path is empty; give the name of a file or folder")
     return Path(path)
 
 
@@ -50,7 +50,7 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 
 def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
-    with _failing(path, "read"):
+    with failing(path, "read"):
         # Only regular files are opened, because opening a pipe would block until another process
         # writes into it.
         if path.exists() and not path.is_file():
@@ -66,7 +66,7 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
 
 
 @contextmanager
-def _failing(path: Path, what: str) -> Iterator[None]:
+def failing(path: Path, what: str) -> Iterator[None]:
     """Convert errors of the file system to `FileError`."""
     try:
         yield
@@ -133,14 +133,14 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
     written: dict[Path, Path] = {}
     try:
         for target in targets:
-            with _failing(target, "written"):
+            with failing(target, "written"):
                 temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
                 temporary.touch(exist_ok=False)  # its mode follows from the umask
             written[temporary] = target
-        with _failing(targets[-1], "written"):
+        with failing(targets[-1], "written"):
             yield list(written)
         for temporary, target in list(written.items()):
-            with _failing(target, "written"):
+            with failing(target, "written"):
                 install(temporary, target)
             del written[temporary]
     finally:
@@ -165,7 +165,7 @@ def followed_path(target: Path) -> Path:
     command reads it.
     """
     real = Path(os.path.realpath(target))
-    with _failing(target, "written"):
+    with failing(target, "written"):
         try:
             mode = os.stat(real).st_mode
         except FileNotFoundError:
@@ -185,7 +185,7 @@ def check_output_path(target: Path) -> None:
     """Raise `FileError` if a target cannot be written; commands call this before any work."""
     from tempfile import TemporaryFile
 
-    with _failing(target, "written"):
+    with failing(target, "written"):
         TemporaryFile(prefix=".fflin-", dir=followed_path(target).parent).close()
 
 

@@ -20,11 +20,10 @@ from fflin.base.writing import as_path
 from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, OfRobot
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array, Indices, Mask
-    from fflin.dynamics.coordinates import Frame
     from fflin.robot.robot import Robot
 
 # Identity placement of the free-flyer joint in Pinocchio's universe frame: position, then
@@ -36,7 +35,7 @@ _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearBatch(validation.Result):
+class LinearBatch(OfRobot):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller
@@ -94,19 +93,6 @@ class LinearBatch(validation.Result):
     u0: Array
     q: Array
     v: Array
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
-    frame: Frame
-    moving: bool
-    robot: str
-    urdf_sha256: str
-    locked: tuple[str, ...]
-    fflin_version: str
-    pinocchio_version: str
     columns: tuple[tuple[int, int, float], ...]
     # _x0 is None if A is the same at all points, as for a robot at rest without forces. x0 then
     # follows from q. _y0 is None if the output is the state.

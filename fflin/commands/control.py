@@ -111,7 +111,9 @@ def export(arguments: Namespace) -> Report:
     )
     test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
     said = f"C99 code of {law!r}, with numbers of type {real}\nto test it in {folder}: {test}"
-    return Report(law.robot, {"name": name, "real": real, "folder": str(folder)}, said)
+    result = {"name": name, "real": real, "folder": str(folder)}
+    endings = (".h", ".c", "_test.c", ".json")
+    return Report(law.robot, result, said, {folder / f"{name}{end}": None for end in endings})
 
 
 def plan(arguments: Namespace) -> Report:

@@ -232,6 +232,23 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
 
+def own_model(gain: Gain, robot: Robot) -> LinearModel:
+    """Linearise a robot at the operating point and reference of a gain that was read from a file.
+
+    Raise `InputError` if the gain was designed for a robot with another URDF.
+    """
+    import pinocchio as pin
+
+    if gain.urdf_sha256 != robot.urdf_sha256:
+        raise InputError(
+            f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
+            "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
+            "or design the gain again"
+        )
+    made = f"the gain was designed for '{gain.robot}'"
+    return model_of(gain, robot, made, pin.XYZQUATToSE3(gain.placement))
+
+
 def make_gain(
     lin: LinearModel,
     part: LinearModel,

@@ -20,10 +20,10 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array
-from fflin.base.writing import as_path, read_file, write_atomically
+from fflin.base.writing import as_path, failing, write_atomically
 from fflin.control.policies import Loop, Measure, Policy
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
@@ -40,6 +40,9 @@ _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477
 _DOUBLE_ERROR = 1e-14
 
 _INVALID = 2  # status of a step with invalid arguments
+
+# Valid names; the code includes the C library's headers float.h, math.h and stdio.h.
+_NAME = r"(?!(float|math|stdio)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 
 def write_c(
@@ -74,14 +77,16 @@ def write_c(
         along a trajectory must be in discrete time.
     folder : path
         Folder for the files; created if it does not exist. Existing files with the same names are
-        replaced only if they were written for the same type of law and the same robot.
+        replaced only if they were written for the same type of law and the same robot, and the
+        code was not edited since.
     robot : Robot, optional
         Robot that the law controls. Give the robot only if the law was read from a file and `load`
         does not know the robot's name in this file.
     limits : "urdf", float, mapping or list, optional
         Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
-        Prefix of the file names and of all names in the C code.
+        Prefix of the file names and of all names in the C code. A program can include headers of
+        two laws only if their names differ in more than upper and lower case.
     real : {"double", "float"}
         Floating-point type of the C code.
 
@@ -97,10 +102,11 @@ def write_c(
 
         - the law cannot be written in C;
         - the robot of the law is not known;
-        - existing files with the same names were not written for the same law and robot;
+        - existing files with the same names were not written for the same law and robot, or were
+          edited;
         - an argument is invalid.
     FileError
-        If a file cannot be written.
+        If the folder or a file cannot be written.
 
     Examples
     --------
@@ -110,29 +116,36 @@ def write_c(
     >>> sorted(path.name for path in folder.iterdir())
     ['controller.c', 'controller.h', 'controller.json', 'controller_test.c']
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
+    if not isinstance(name, str) or not re.fullmatch(_NAME, name):
         raise InputError(
-            f"name is {name!r}, expected a letter and then letters, digits or _, for names in C"
+            f"name is {name!r}, expected a letter and then letters, digits or _, for names in C, "
+            "except float, math and stdio"
         )
     if not isinstance(real, str) or real not in ("double", "float"):
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
     target = as_path(folder)
     title, texts = _texts(law_of(law, robot, limits), name, real)
     contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
-    old = next((path for path in contents if path.exists()), None)
+    with failing(target, "written"):
+        old = next((path for path in contents if path.exists()), None)
+        new = [each for each in (target, *target.parents) if not each.exists()]
     there = None
-    with suppress(OSError, ValueError, TypeError, LookupError):
-        there = json.loads((target / f"{name}.json").read_bytes())["title"]
+    with suppress(FileError, TypeError):
+        there = _description(target / f"{name}.json")["title"]
     if old and there != title:
         raise InputError(
-            f"{old} exists and does not belong to the {title}; give another name= (--name) or "
-            "another folder, or delete the file"
+            f"{old} exists and does not belong to the {title}, or the code was edited; give "
+            "another name= (--name) or another folder, or delete the files of this name"
         )
     try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be made: {error.strerror}") from None
-    write_atomically(contents)
+        with failing(target, "written"):
+            target.mkdir(parents=True, exist_ok=True)
+        write_atomically(contents)
+    except BaseException:
+        for each in new:  # leave no empty folder
+            with suppress(OSError):
+                each.rmdir()
+        raise
     return target
 
 
@@ -140,6 +153,19 @@ def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     """Return the SHA-256 of a law's description, header and source, to detect any change."""
     parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
     return content_digest(parts)
+
+
+def _description(path: Path) -> dict[str, Any]:
+    """Return the description of C code, or raise `FileError` if code or header were edited."""
+    with reading(path, "description of C code"):
+        about: dict[str, Any] = json.loads(path.read_bytes())
+        header, code = (path.with_suffix(ending).read_bytes() for ending in (".h", ".c"))
+        if about.pop("sha256") != digest_of(about, header, code):
+            raise FileError(
+                f"{path}: does not belong to its .c and .h files, or one of these files was "
+                "edited; delete them, and write them again with fflin.write_c"
+            )
+    return about
 
 
 class CLaw:
@@ -192,26 +218,17 @@ class CLaw:
     def __init__(
         self, folder: str | Path, *, name: str | None = None, compiler: str = "cc"
     ) -> None:
-        source = as_path(folder).resolve()
+        with failing(as_path(folder), "read"):
+            source = as_path(folder).resolve()
+            pairs = [x.stem for x in source.iterdir() if x.suffix == ".json"]
+            found = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
         self._made = partial(CLaw, source, name=name, compiler=compiler)
-        pairs = [path.stem for path in source.glob("*.json") if path.with_suffix(".c").is_file()]
-        found = [each for each in pairs if name in (None, each)]
-        if len(found) != 1:
-            raise FileError(
-                f"{source}: contains {len(found)} pairs of .json and .c files, expected one pair "
-                "that fflin.write_c wrote; if there are several pairs, choose one with name="
-            )
+        if not found:
+            raise FileError(f"{source}: contains no C code of '{name or 'any'}' by fflin.write_c")
+        if len(found) > 1:
+            raise FileError(f"{source}: contains the laws {listed(found)}; choose one with name=")
         [self.name] = found
-        about, header, code = (source / f"{self.name}.{end}" for end in ("json", "h", "c"))
-        with reading(about, "description of C code"):
-            self._about: dict[str, Any] = json.loads(read_file(about, ".json"))
-            digest = self._about.pop("sha256")
-            texts = read_file(header, ".h"), read_file(code, ".c")
-        if digest != digest_of(self._about, *texts):
-            raise FileError(
-                f"{about}: does not belong to {code.name} and {header.name}, or one of these files "
-                "was edited; write them again with fflin.write_c"
-            )
+        self._about = _description(source / f"{self.name}.json")
         self.dt: float = self._about["dt"]
         self.frame: str = self._about["frame"]
         placement = self._about["reference"]
@@ -222,7 +239,8 @@ class CLaw:
                 "its outputs; write the C code from an OutputFeedback"
             )
         self._real = np.float64 if self._about["real"] == "double" else np.float32
-        self._step = getattr(_compiled(code, compiler), f"{self.name}_step")
+        library = _compiled(source / f"{self.name}.c", compiler)
+        self._step = getattr(library, f"{self.name}_step")
 
     def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
         return self._made, ()  # compile again, because a loaded library cannot be copied
@@ -298,18 +316,18 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         raise MissingPackageError(
             f"there is no C compiler '{compiler}'; install one, such as gcc, or give compiler="
         )
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "law.so"
-        flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
-        command = [found, *flags, "-o", str(library), str(source), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
-            raise InputError(f"{source}: cannot be compiled: {line}")
-        try:
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            library = Path(folder) / "law.so"
+            flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
+            command = [found, *flags, "-o", str(library), str(source), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
+                raise InputError(f"{source}: cannot be compiled: {line}")
             return ctypes.CDLL(str(library))
-        except OSError as error:
-            raise InputError(f"'{compiler}' made no library from {source}: {error}") from None
+    except OSError as error:
+        raise InputError(f"'{compiler}' made no library from {source}: {error}") from None
 
 
 def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:

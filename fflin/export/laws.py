@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import pinocchio as pin
 from numpy.linalg import norm
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
-from fflin.control.gain import Gain, model_of
+from fflin.control.gain import Gain, own_model
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
@@ -114,16 +113,15 @@ def law_of(given: object, robot: object, limits: object) -> Law:
 
 
 def _state_law(given: OfStates, robot: Robot) -> Law:
-    lin, axes = None, dict[str, Array]()
+    lin, axes, title = None, dict[str, Array](), type(given).__name__
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
-    title = type(given).__name__
     if isinstance(given, TrajectoryFeedback):
         dt, state = given.schedule.dt, given.state_map(robot)
         tables = _samples(given, state)
     else:
         if isinstance(given, Gain):
-            dt, given = given.dt, StateFeedback(given._lin or _model_of(given, robot), given.K)
+            dt, given = given.dt, StateFeedback(given._lin or own_model(given, robot), given.K)
         else:
             dt = given.lin.dt
         lin = given.lin
@@ -202,21 +200,6 @@ def _state_cases(
         size = np.abs(x0) + np.hstack((pose, joints[0], rates, joints[1]))
         K = np.abs(tables["K"]).max(axis=0) if axes else np.abs(tables["K"][row])
         yield Case(row, given, u, np.abs(u0) + K @ size)
-
-
-def _model_of(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise a robot at the operating point and reference of a gain that was read from a file.
-
-    Raise `InputError` if the gain was designed for a robot with another URDF.
-    """
-    if gain.urdf_sha256 != robot.urdf_sha256:
-        raise InputError(
-            f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
-            "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
-            "or design the gain again"
-        )
-    made = f"the gain was designed for '{gain.robot}'"
-    return model_of(gain, robot, made, pin.XYZQUATToSE3(gain.placement))
 
 
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:

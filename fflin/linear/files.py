@@ -123,8 +123,6 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
         if fields["frame"] not in get_args(Frame):
             raise ValueError(f"unknown frame '{fields['frame']}'")
         sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
-        if sizes != {signal: len(fields[f"{signal}_units"]) for signal in _SIGNALS}:
-            raise ValueError("the number of its signals differs from the number of their units")
         sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
         sizes["drift"] = sizes["state"] if np.size(entries["drift"]) else 0
         sizes["limit"] = len(limit_names := fields.pop("limit_names"))
@@ -139,7 +137,7 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
         ):
             raise ValueError("its weights are not a table")
         drift, limits = fields.pop("drift"), fields.pop("limits").tolist()
-        return fields | {
+        fields |= {
             "moving": bool(fields["moving"]),
             "verified": verified,
             "placement": fields.pop("reference"),
@@ -147,7 +145,9 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
             "_inertia": partial(given, fields.pop("M")),
             "_ignorable": partial(given, fields.pop("ignorable")),
             "_limits": partial(dict, dict(zip(limit_names, limits, strict=True))),
-        }, certificate(**figures(entries["certificate"]))
+        }
+        record.require_possible(fields)
+        return fields, certificate(**figures(entries["certificate"]))
 
 
 def given(value: T, _: object) -> T:

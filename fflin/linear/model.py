@@ -63,7 +63,32 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StateSpace(Result):
+class SignalNames(Result):
+    """Names and units of the signals of linear models."""
+
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OfRobot(SignalNames):
+    """Frame, robot and package versions for which linear models were computed."""
+
+    frame: Frame
+    moving: bool
+    robot: str
+    urdf_sha256: str
+    locked: tuple[str, ...]
+    fflin_version: str
+    pinocchio_version: str
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StateSpace(SignalNames):
     """Matrices of a linear model about a point, with names and units of the signals."""
 
     A: Array
@@ -75,16 +100,10 @@ class StateSpace(Result):
     u0: Vector
     y0: Vector
     dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
-class LinearModel(StateSpace):
+class LinearModel(OfRobot, StateSpace):
     r"""Linear model about an operating point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the model is in discrete
@@ -156,15 +175,8 @@ class LinearModel(StateSpace):
     (0.0, 0.1)
     """
 
-    frame: Frame
-    moving: bool
     q: Array
     v: Array
-    robot: str
-    urdf_sha256: str
-    locked: tuple[str, ...]
-    fflin_version: str
-    pinocchio_version: str
     placement: Array
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()

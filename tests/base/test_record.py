@@ -172,6 +172,31 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, tmp_path):
             assert "\n" not in str(error)
 
 
+@pytest.mark.parametrize(
+    ("kind", "change", "said"),
+    [
+        ("gain", {"dt": -1.0}, "dt is -1"),
+        ("gain", {"dt": np.nan}, "dt is nan"),
+        ("gain", {"margin": np.inf}, "margin is inf"),
+        ("gain", {"placement": np.zeros(3)}, "placement"),
+        ("gain", {"placement": np.zeros(7)}, "placement"),
+        ("gain", {"input_units": ["N m"]}, "number of its input_units"),
+        ("model", {"dt": -1.0}, "dt is -1"),
+        ("model", {"reference": np.zeros(7)}, "placement"),
+        ("model", {"state_units": ["rad"]}, "number of its state_units"),
+    ],
+)
+def test_an_impossible_value_in_a_file_without_a_digest_is_refused(kind, change, said, tmp_path):
+    thing, path = made(kind), tmp_path / "x.npz"
+    thing.save(path)
+    with np.load(path) as file:
+        record = {key: file[key] for key in file.files if key != "sha256"}
+    assert change.keys() <= record.keys()
+    np.savez(path, **record | change)
+    with pytest.raises(fflin.FileError, match=rf"x\.npz: .*{said}"):
+        type(thing).load(path)
+
+
 def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
     path = tmp_path / "x.json"
     made("model").save(path)

@@ -1,5 +1,7 @@
 """The command export: from a saved design to C code."""
 
+import json
+
 import fflin
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
 from tests.support.commands import refused, run
@@ -20,6 +22,8 @@ def test_a_gain_and_a_compensator_become_c_code(tmp_path):
         code, out, err = run("export", tmp_path / file, "-o", folder, *options)  # once more
         assert (code, err) == (0, "")
         assert "_test.c" in out
+        written = json.loads(run("export", tmp_path / file, "-o", folder, *options, "--json")[1])
+        assert {*written["files"]} == {*map(str, folder.iterdir())} and len(written["files"]) == 4
         name = options[-1] if options else "controller"
         assert outcome(folder, COMPILERS[0], name)[0] == 0
 

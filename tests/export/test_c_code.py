@@ -1,16 +1,23 @@
 """C code of every kind of law, compared with the policies that simulations use."""
 
 import copy
+import errno
 import json
 import pickle
 import re
+import tempfile
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.dynamics.state import StateMap
+from fflin.export.c_code import _compiled
+from fflin.export.laws import measured
 from fflin.robot.catalog import find_robot
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
 from tests.support.policies import between_gains, compensated
@@ -194,6 +201,7 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
     ("change", "match"),
     [
         ({"name": "3d"}, "a letter"),
+        ({"name": "math"}, "except float, math and stdio"),
         ({"real": "half"}, "'double' or 'float'"),
         ({"law": 3}, "Gain, StateFeedback"),
         ({"robot": "cubesat"}, "a Robot"),
@@ -218,8 +226,10 @@ def test_the_code_is_not_flown_with_another_robot(tmp_path):
     code = fflin.CLaw(fflin.write_c(law("hybrid")[1], tmp_path))
     with pytest.raises(fflin.InputError, match="the given robot 'planar_detumble' lacks"):
         code.bind(fflin.load("planar_detumble"))
-    with pytest.raises(fflin.FileError, match="contains 0"):
+    with pytest.raises(fflin.FileError, match=r"nowhere: No such file"):
         fflin.CLaw(tmp_path / "nowhere")
+    with pytest.raises(fflin.FileError, match="contains no C code of 'other'"):
+        fflin.CLaw(tmp_path, name="other")
     with pytest.raises(fflin.MissingPackageError, match="no C compiler"):
         fflin.CLaw(tmp_path, compiler="no_such_compiler")
 
@@ -293,13 +303,80 @@ def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     fflin.write_c(fflin.OutputFeedback(lin, by), tmp_path, name="filter")
     fflin.write_c(fflin.lqr(lin, 2.0, 1.0), tmp_path)  # the same gain, tuned again
-    with pytest.raises(fflin.FileError, match="contains 2 pairs"):
+    with pytest.raises(fflin.FileError, match="contains the laws controller, filter; choose one"):
         fflin.CLaw(tmp_path)
     names = [fflin.CLaw(tmp_path, name=name).name for name in ("controller", "filter")]
     assert names == ["controller", "filter"]
     (tmp_path / "own.c").write_text("int main(void) { return 0; }")
     with pytest.raises(fflin.InputError, match=r"own\.c exists"):
         fflin.write_c(gain, tmp_path, name="own")
+
+
+@pytest.mark.parametrize("ending", ["c", "h"])
+def test_edited_code_is_not_overwritten(ending, tmp_path):
+    by = law("no joints")[1]
+    fflin.write_c(by, tmp_path)
+    path = tmp_path / f"controller.{ending}"
+    path.write_text(f"{path.read_text()}/* reviewed */\n")
+    before = {each: each.read_bytes() for each in tmp_path.iterdir()}
+    with pytest.raises(fflin.InputError, match="or the code was edited"):
+        fflin.write_c(by, tmp_path)
+    assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
+
+
+def test_a_schedule_is_written_again_over_itself(tmp_path):
+    robot, by = law("schedule")
+    for _ in range(2):
+        fflin.write_c(by, tmp_path, robot=robot)
+    assert "in C99: GainSchedule\n" in (tmp_path / "controller.h").read_text()
+
+
+def test_folders_that_cannot_be_used_are_one_line(tmp_path, monkeypatch):
+    by = law("no joints")[1]
+    (tmp_path / "file").touch()
+    for folder, said in (("a" * 300, "File name too long"), ("file/c", "Not a directory")):
+        with pytest.raises(fflin.FileError, match=said):
+            fflin.write_c(by, tmp_path / folder)
+        with pytest.raises(fflin.FileError, match=said):
+            fflin.CLaw(tmp_path / folder)
+    fflin.write_c(by, tmp_path / "c")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    with pytest.raises(fflin.InputError, match="'cc' made no library"):
+        fflin.CLaw(tmp_path / "c")
+
+
+def test_what_fails_leaves_no_folder(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "own").mkdir()
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for folder in ("new/deep", "own/new", "own"):
+        with pytest.raises(fflin.FileError, match="No space left"):
+            fflin.write_c(law("no joints")[1], tmp_path / folder)
+    assert [*tmp_path.rglob("*")] == [tmp_path / "own"]
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_invalid_arguments_give_the_inputs_at_the_target_and_a_state_of_zeros(real, tmp_path):
+    robot, by = law("hybrid")
+    code = fflin.CLaw(fflin.write_c(by, tmp_path, real=real, limits=0.5))
+    library = _compiled(tmp_path / "controller.c", "cc")
+    kind = np.float64 if real == "double" else np.float32
+    good = measured(StateMap(robot), by.lin.q, by.lin.v).astype(kind)
+    u0, seen = np.clip(by.lin.u0, -0.5, 0.5), set()
+    for index, value in product(range(len(good)), (np.nan, np.inf, -np.inf, np.finfo(kind).max)):
+        given, x, u = (np.full(len(each), 7.0, kind) for each in (good, by.lin.x0, u0))
+        given[:] = good
+        given[index] = value
+        status = library.controller_state(given.ctypes, x.ctypes)
+        assert not x.any() if status == 2 else np.isfinite(x).all()
+        status = library.controller_step(given.ctypes, u.ctypes)
+        assert u == pytest.approx(u0, abs=1e-12) if status == 2 else (np.abs(u) <= 0.5).all()
+        seen.add((bool(np.isfinite(value)), status))
+    # A finite argument that is too large reaches the limits, or overflows.
+    assert seen == {(False, 2), (True, 1), (True, 2)}
+    assert repr(code).startswith("CLaw('controller'")
 
 
 def test_copies_of_the_code_fly_as_the_code(tmp_path):

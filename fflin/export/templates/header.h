@@ -28,10 +28,13 @@ typedef $real ${name}_real;
 /* Status that a step returns. */
 #define ${NAME}_OK 0
 #define ${NAME}_LIMITED 1 /* an input was set to its limit */
-#define ${NAME}_INVALID 2 /* an argument is not finite, a continuous joint is
-                           turned by more than a million turns, or the length
-                           of the quaternion is not between 0.5 and 2; u is u0
-                           within the limits, and a state is zero */
+#define ${NAME}_INVALID 2 /* an argument is not finite, a result is too large
+                           for $real, a continuous joint is turned by more
+                           than a million turns, or the length of the
+                           quaternion is not between 0.5 and 2 */
+
+/* If the status is INVALID, the inputs u are u0 within the limits, and all
+ * states x are zero. */
 
 $interface
 #endif

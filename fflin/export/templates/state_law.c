@@ -108,6 +108,9 @@ static int state_at(unsigned long row, const ${name}_measured *measured,
     for (i = 0; i < ${NAME}_STATES; i++) {
         ok = is_finite(x[i]) && ok;
     }
+    for (i = 0; i < ${NAME}_STATES && !ok; i++) {
+        x[i] = 0;
+    }
     return ok ? ${NAME}_OK : ${NAME}_INVALID;
 }
 
