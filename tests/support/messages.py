@@ -34,6 +34,9 @@ VARIES = [
     (re.escape(str(Path.home())), "HOME"),
     (r"[\d.,]+ [kMGTP]B\b", "SIZE"),
     (r"\(choose from [^)]*\)", "(choose from CHOICES)"),
+    # Texts of NumPy, and lists of SciPy's distributions, which depend on their versions.
+    (r"\((This file contains|Cannot load file containing) pickled.*", "(PICKLED)"),
+    (r"(no distribution of scipy\.stats named '\w+'; ).*", r"\1NAMES"),
     (r"(maximum recursion depth exceeded)[a-zA-Z ]*", r"\1"),
 ]
 LONGEST = 400
