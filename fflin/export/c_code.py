@@ -224,7 +224,8 @@ class CLaw:
             found = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
         self._made = partial(CLaw, source, name=name, compiler=compiler)
         if not found:
-            raise FileError(f"{source}: contains no C code of '{name or 'any'}' by fflin.write_c")
+            named = f" named '{name}'" if name else ""
+            raise FileError(f"{source}: contains no C code{named} that fflin.write_c wrote")
         if len(found) > 1:
             raise FileError(f"{source}: contains the laws {listed(found)}; choose one with name=")
         [self.name] = found

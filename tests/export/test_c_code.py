@@ -229,7 +229,7 @@ def test_the_code_is_not_flown_with_another_robot(tmp_path):
         code.bind(fflin.load("planar_detumble"))
     with pytest.raises(fflin.FileError, match=r"nowhere: No such file"):
         fflin.CLaw(tmp_path / "nowhere")
-    with pytest.raises(fflin.FileError, match="contains no C code of 'other'"):
+    with pytest.raises(fflin.FileError, match="contains no C code named 'other' that"):
         fflin.CLaw(tmp_path, name="other")
     with pytest.raises(fflin.MissingPackageError, match="no C compiler"):
         fflin.CLaw(tmp_path, compiler="no_such_compiler")

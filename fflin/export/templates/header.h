@@ -33,8 +33,8 @@ typedef $real ${name}_real;
                            than a million turns, or the length of the
                            quaternion is not between 0.5 and 2 */
 
-/* If the status is INVALID, the inputs u are u0 within the limits, and all
- * states x are zero. */
+/* If the status is INVALID, the inputs u are u0 within the limits, all states x
+ * are zero, and the memory of a controller is unchanged. */
 
 $interface
 #endif
