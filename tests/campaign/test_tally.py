@@ -50,6 +50,7 @@ def rows_of(state, rng, inputs):
     nu = fade[..., None] * rng.normal(size=(STEPS, LANES, 6 + robot.n))
     v = state.spread(nu).reshape(-1, robot.nv)
     q = np.array([pin.integrate(robot.model, robot.neutral(), 2.0 * each) for each in v])
+    q[rng.random(len(q)) < 0.5, 3:7] *= -1.0  # the same attitude
     for row in q:
         robot.follow(row)
     return q.reshape(STEPS, LANES, -1), nu, rng.normal(size=(STEPS, LANES, inputs))
@@ -92,6 +93,8 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         if follows:
             star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
             target = states_of(state, *star)
+        elif robot.n:
+            target = target + 7.0 * (np.arange(state.nx) == 6)  # more than a turn away
         rest = [np.zeros((STEPS, size)) for size in (6, 3)]
         t, v = job.plan.times.dt * np.arange(STEPS), state.spread(nu)
         run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
@@ -116,10 +119,25 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
             ("largest", marks.largest),
             ("error_history", np.reshape(marks.errors, (-1, len(KINDS)))),
             ("settle", settled),
+            ("input_history", np.reshape(marks.inputs, (-1, len(job.plan.initial)))),
             ("state_errors", np.reshape(marks.states, (-1, state.nx))),
             ("x", marks.law.x),
         ):
             np.testing.assert_allclose(value, expected[name], rtol=1e-12, atol=1e-10)
+
+
+def test_errors_settle_within_a_fiftieth_of_the_largest_or_within_the_tolerance():
+    robot = free_body((20.0, 30.0, 40.0))
+    job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", {"duration": 0.05, "dt": 0.01})
+    marks, nu = as_lists(RunStatistics(job)._marks), np.zeros((6, 6))
+    q = np.tile(robot.neutral(), (6, 1))
+    q[:, 1] = (-1.0, 0.5, 0.03, 0.01, -0.021, 0.019)
+    nu[:, 2] = (4e-9, 2e-9, 1.1e-9, 0.9e-9, 0.5e-9, 0.9e-9)  # more than a fiftieth of 4e-9
+    nu[:, 4] = 0.9 * THERE
+    take(marks, np.hstack((q, nu, np.zeros((6, 6 + 9)))).ravel().tolist(), 0, 6)
+    last = dict(zip(KINDS, marks.outside, strict=True))
+    assert (last["position"], last["omega_b"], last["v_b"]) == (4.0, 2.0, -1.0)
+    assert last["attitude"] == last["joints"] == last["joint rates"] == -1.0
 
 
 def as_lists(value):

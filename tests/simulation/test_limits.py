@@ -150,6 +150,34 @@ def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
     assert (told.name, told.value, told.time, told.limit) == ("qdot_m.spin", 301.0, 0.0, SPEED)
 
 
+def test_a_wheel_without_a_limit_of_its_torque_stops_at_its_largest_speed():
+    robot = spinner(max=None)
+    motion = fflin.simulate(robot, lambda t, q, v: [0.5], duration=20.0, limits="urdf")
+    speed = motion.x[:, motion.state_names.index("qdot_m.spin")]
+    assert motion.u[0, 0] == 0.5 and speed[-1] == pytest.approx(SPEED, rel=1e-9)
+    assert speed.max() <= SPEED * (1.0 + 1e-12)
+
+
+def test_each_of_three_wheels_stops_at_its_own_largest_speed():
+    speeds, axes = (100.0, 200.0, 300.0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    wheels = [
+        fflin.ReactionWheel(axis, name=f"w_{speed:.0f}", inertia=INERTIA, max_speed=speed)
+        for axis, speed in zip(axes, speeds, strict=True)
+    ]
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=wheels)
+    motion = fflin.simulate(robot, lambda t, q, v: [0.5] * 3, duration=15.0, limits="urdf")
+    rates = motion.x[:, [motion.state_names.index(f"qdot_m.w_{x:.0f}") for x in speeds]]
+    # The body turns, so that each torque also changes the speeds of the other wheels a little.
+    assert rates.max(axis=0) == pytest.approx(speeds, rel=1e-4)
+
+
+def test_a_least_impulse_of_a_whole_sample_is_fired():
+    thruster = fflin.Thruster(*AT, max=2.0, on_off=True, least_impulse=0.2)
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[thruster])
+    motion = fflin.simulate(robot, lambda t, q, v: [1.0], duration=0.4, dt=0.01, sample=0.1)
+    assert motion.u[:-1, 0].tolist() == [*[0.0] * 10, *[2.0] * 10] * 2
+
+
 def test_an_on_off_thruster_gives_its_own_thrust_whatever_the_run_allows():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=2.0, on_off=True), fflin.BaseTorque()]
