@@ -44,7 +44,6 @@ DAMAGED = f"its content does not match its {CHECKSUM}: the file was damaged or e
 
 _BLOCK = 2**22
 _LARGEST = 1e300
-_NO_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 # Matches the remains of a damaged header that contained a digest.
@@ -305,21 +304,32 @@ class Design(Result):
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
             values = {item.name: _value(item, record[item.name]) for item in _saved(cls)}
-            require_possible(values)
+            require_possible(values, getattr(cls, "SHAPES", ""))
             return cls(**given, **values, verified=verified)
 
 
-def require_possible(values: Record) -> None:
-    """Raise `ValueError` if numbers, units or a pose from a file are impossible."""
+def require_possible(values: Record, shapes: str = "") -> None:
+    """Raise `ValueError` if values from a file are impossible or contradict each other.
+
+    `shapes` contains a shape ``name:letters`` for some entries, with one letter for each dimension.
+    All dimensions with the same letter must have the same length.
+    """
     for key, value in values.items():
-        if isinstance(value, float) and not (np.isfinite(value) and (value >= 0.0 or key != "dt")):
-            least = " of at least 0" * (key == "dt")
-            raise ValueError(f"{key} is {value:g}, expected a finite number{least}")
+        if isinstance(value, float) and not (-_LARGEST if key != "dt" else 0) <= value <= _LARGEST:
+            raise ValueError(f"{key} is {value:g}, which is not possible")
         if key.endswith("_units") and len(value) != len(values[key.replace("units", "names")]):
             raise ValueError(f"the number of its {key} differs from the number of names")
-    pose: Array = np.ravel(values.get("placement", _NO_POSE))
-    if pose.size != 7 or abs(float(np.linalg.norm(pose[3:])) - 1.0) > NORM_TOLERANCE:
-        raise ValueError("placement is not a position and a unit quaternion (7,)")
+        if key == "placement" and not _is_pose(value):
+            raise ValueError("placement is not a position and a unit quaternion (7,)")
+    lengths: dict[str, int] = {}
+    for key, letters in (each.split(":") for each in shapes.split()):
+        shape = np.shape(values[key])
+        if tuple(map(lengths.setdefault, letters, shape)) != shape or len(shape) < len(letters):
+            raise ValueError(f"{key} has shape {shape}, which does not fit to the other entries")
+
+
+def _is_pose(values: Array) -> bool:
+    return values.shape == (7,) and abs(float(np.linalg.norm(values[3:])) - 1.0) <= NORM_TOLERANCE
 
 
 def record_of(design: Design) -> Record:
@@ -347,7 +357,8 @@ def _value(item: Field[object], raw: object) -> Any:
     if isinstance(raw, dict):
         raw = np.array(raw["real"]) + 1j * np.array(raw["imag"])
     array = np.asarray(raw)
-    if array.dtype.kind not in "fiuc" or not np.isfinite(array).all():
+    kinds = "fiuc" if item.type == "Poles" else "fiu"
+    if array.dtype.kind not in kinds or not np.isfinite(array).all():
         raise ValueError(f"{item.name} is not an array of finite numbers")
     array = array.astype(complex if array.dtype.kind == "c" else float)
     if item.type == "Open":

@@ -132,6 +132,8 @@ class Compensator(ModelDesign):
     ((18, 18), True)
     """
 
+    SHAPES = "A:zz B:zy C:uz y0:y u0:u input_names:y output_names:u"
+
     C: Array
     poles: Poles
     y0: Vector

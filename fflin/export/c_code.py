@@ -118,8 +118,7 @@ def write_c(
     """
     if not isinstance(name, str) or not re.fullmatch(_NAME, name):
         raise InputError(
-            f"name is {name!r}, expected a letter and then letters, digits or _, for names in C, "
-            "except float, math and stdio"
+            f"name is {name!r}, expected a letter, then letters, digits, _; not float, math, stdio"
         )
     if not isinstance(real, str) or real not in ("double", "float"):
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
@@ -151,8 +150,7 @@ def write_c(
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     """Return the SHA-256 of a law's description, header and source, to detect any change."""
-    parts = {"about": json.dumps(about).encode(), "header": header, "source": source}
-    return content_digest(parts)
+    return content_digest({"about": json.dumps(about).encode(), "header": header, "source": source})
 
 
 def _description(path: Path) -> dict[str, Any]:
@@ -240,8 +238,7 @@ class CLaw:
                 "its outputs; write the C code from an OutputFeedback"
             )
         self._real = np.float64 if self._about["real"] == "double" else np.float32
-        library = _compiled(source / f"{self.name}.c", compiler)
-        self._step = getattr(library, f"{self.name}_step")
+        self._step = getattr(_compiled(source / f"{self.name}.c", compiler), f"{self.name}_step")
 
     def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
         return self._made, ()  # compile again, because a loaded library cannot be copied

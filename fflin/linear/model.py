@@ -63,14 +63,20 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SignalNames(Result):
-    """Names and units of the signals of linear models."""
+class StatesAndInputs(Result):
+    """Names and units of states and inputs."""
 
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_units: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SignalNames(StatesAndInputs):
+    """Names and units of the signals of linear models."""
+
+    output_names: tuple[str, ...]
     output_units: tuple[str, ...]
 
 

@@ -20,6 +20,7 @@ from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors,
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
+from fflin.linear.model import StatesAndInputs
 from fflin.linear.trajectory import Trajectory, along
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
@@ -35,7 +36,7 @@ _MET = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Motion(Design):
+class Motion(StatesAndInputs, Design):
     """Simulated or recorded motion of a robot, with one row per time.
 
     Attributes
@@ -135,10 +136,6 @@ class Motion(Design):
     momentum: Array
     momentum_drift: Vector
     placement: Vector
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
     frame: str
     robot: str
     urdf_sha256: str

@@ -33,6 +33,8 @@ def made(kind):
     if kind in ("batch", "gains"):
         batch = fflin.sweep(robot, fflin.random_configurations(robot, 6, seed=1))
         return batch if kind == "batch" else fflin.lqr_batch(batch, 1.0, 1.0)
+    if kind == "compensator":
+        return fflin.lqg(made("gain"), made("estimator"))
     if kind == "motion":
         return fflin.simulate(robot, duration=0.05, dt=0.01)
     return lin if kind == "model" else _DESIGNS[kind](lin, 1.0, 1.0)
@@ -178,9 +180,16 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, tmp_path):
         ("gain", {"dt": -1.0}, "dt is -1"),
         ("gain", {"dt": np.nan}, "dt is nan"),
         ("gain", {"margin": np.inf}, "margin is inf"),
+        ("gain", {"x0": np.zeros(30) + 1j}, "x0 is not an array of finite numbers"),
         ("gain", {"placement": np.zeros(3)}, "placement"),
         ("gain", {"placement": np.zeros(7)}, "placement"),
         ("gain", {"input_units": ["N m"]}, "number of its input_units"),
+        ("schedule", {"K": np.zeros((2, 6))}, "K has shape"),
+        ("schedule", {"K": np.zeros((3, 6, 13))}, "shape"),
+        ("schedule", {"t": np.zeros(2)}, "shape"),
+        ("compensator", {"A": np.zeros(3)}, "A has shape"),
+        ("compensator", {"C": np.zeros((8, 15))}, "shape"),
+        ("compensator", {"y0": np.zeros(3)}, "shape"),
         ("model", {"dt": -1.0}, "dt is -1"),
         ("model", {"reference": np.zeros(7)}, "placement"),
         ("model", {"state_units": ["rad"]}, "number of its state_units"),

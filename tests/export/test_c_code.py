@@ -202,7 +202,7 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
     ("change", "match"),
     [
         ({"name": "3d"}, "a letter"),
-        ({"name": "math"}, "except float, math and stdio"),
+        ({"name": "math"}, "not float, math, stdio"),
         ({"real": "half"}, "'double' or 'float'"),
         ({"law": 3}, "Gain, StateFeedback"),
         ({"robot": "cubesat"}, "a Robot"),
