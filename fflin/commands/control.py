@@ -109,8 +109,10 @@ def export(arguments: Namespace) -> Report:
     folder = fflin.write_c(
         law, arguments.output_folder, robot=robot, limits=limits, name=name, real=real
     )
-    test = f"cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm && ./{name}_test"
-    said = f"C99 code of {law!r}, with numbers of type {real}\nto test it in {folder}: {test}"
+    test = (
+        f"cd '{folder}'\n  cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm\n  ./{name}_test"
+    )
+    said = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
     result = {"name": name, "real": real, "folder": str(folder)}
     endings = (".h", ".c", "_test.c", ".json")
     return Report(law.robot, result, said, {folder / f"{name}{end}": None for end in endings})

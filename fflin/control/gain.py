@@ -41,7 +41,10 @@ _FRAGILE = 0.3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelDesign(Design):
-    """Design for a linear model ``dx/dt = A x + B u``, or for a sampled model if dt is not 0."""
+    """Design for a linear model ``dx/dt = A x + B u``, or for a sampled model if dt is not 0.
+
+    `urdf_sha256` is the SHA-256 of the URDF of the robot for which the design was made.
+    """
 
     A: Array
     B: Array
@@ -49,6 +52,7 @@ class ModelDesign(Design):
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     robot: str
+    urdf_sha256: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,6 +108,8 @@ class Gain(ModelDesign):
     True
     """
 
+    SHAPES = "K:ux P:xx Q:xx R:uu N:xu A:xx B:xu x0:x u0:u state_names:x input_names:u"
+
     K: Array
     P: Array
     poles: Poles
@@ -121,7 +127,6 @@ class Gain(ModelDesign):
     weights: str
     regulated: tuple[str, ...]
     placement: Vector
-    urdf_sha256: str
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
@@ -230,23 +235,6 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(gain.x0)
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
-
-
-def own_model(gain: Gain, robot: Robot) -> LinearModel:
-    """Linearise a robot at the operating point and reference of a gain that was read from a file.
-
-    Raise `InputError` if the gain was designed for a robot with another URDF.
-    """
-    import pinocchio as pin
-
-    if gain.urdf_sha256 != robot.urdf_sha256:
-        raise InputError(
-            f"the gain was designed for another '{gain.robot}' than the given '{robot.name}': "
-            "their masses or URDFs differ; give the robot of the design with robot= (--robot), "
-            "or design the gain again"
-        )
-    made = f"the gain was designed for '{gain.robot}'"
-    return model_of(gain, robot, made, pin.XYZQUATToSE3(gain.placement))
 
 
 def make_gain(

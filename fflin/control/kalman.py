@@ -420,6 +420,7 @@ def tvkalman(
         V=V,
         residual=residual,
         robot=traj.robot.name,
+        urdf_sha256=traj.robot.urdf_sha256,
         dt=dt,
         verified=traj.verified,
     )

@@ -361,6 +361,7 @@ def tvlqr(
         Qf=Qf,
         residual=residual,
         robot=traj.robot.name,
+        urdf_sha256=traj.robot.urdf_sha256,
         dt=dt,
         weights=rule,
         knots=traj.t,

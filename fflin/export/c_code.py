@@ -35,14 +35,8 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
-# Largest relative rounding error that the test program accepts in double precision. The error of
-# each result is relative to `Case.scale`, the sum of the magnitudes of its terms.
-_DOUBLE_ERROR = 1e-14
-
-_INVALID = 2  # status of a step with invalid arguments
-
-# Valid names; the code includes the C library's headers float.h, math.h and stdio.h.
-_NAME = r"(?!(float|math|stdio)$)[A-Za-z][A-Za-z0-9_]{0,40}"
+# Valid names, without those of headers that the code or the C library includes.
+_NAME = r"(?!(features|float|math|std\w*)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 
 def write_c(
@@ -77,11 +71,12 @@ def write_c(
         along a trajectory must be in discrete time.
     folder : path
         Folder for the files; created if it does not exist. Existing files with the same names are
-        replaced only if they were written for the same type of law and the same robot, and the
-        code was not edited since.
+        replaced only if they were written for the same type of law and the same robot, and if the
+        header and the source were not edited since.
     robot : Robot, optional
-        Robot that the law controls. Give the robot only if the law was read from a file and `load`
-        does not know the robot's name in this file.
+        Robot for which the law was designed. Give it if the law does not contain the robot, and
+        `load` does not return this robot for its name. Laws that were read from a file, and every
+        `Compensator`, do not contain the robot.
     limits : "urdf", float, mapping or list, optional
         Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
@@ -118,7 +113,7 @@ def write_c(
     """
     if not isinstance(name, str) or not re.fullmatch(_NAME, name):
         raise InputError(
-            f"name is {name!r}, expected a letter, then letters, digits, _; not float, math, stdio"
+            f"name is {name!r}, expected letters, digits or _ after a letter; not float, math, std*"
         )
     if not isinstance(real, str) or real not in ("double", "float"):
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
@@ -126,7 +121,7 @@ def write_c(
     title, texts = _texts(law_of(law, robot, limits), name, real)
     contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
     with failing(target, "written"):
-        old = next((path for path in contents if path.exists()), None)
+        old = next((x for x in contents if target.exists() and x in {*target.iterdir()}), None)
         new = [each for each in (target, *target.parents) if not each.exists()]
     there = None
     with suppress(FileError, TypeError):
@@ -218,7 +213,7 @@ class CLaw:
     ) -> None:
         with failing(as_path(folder), "read"):
             source = as_path(folder).resolve()
-            pairs = [x.stem for x in source.iterdir() if x.suffix == ".json"]
+            pairs = sorted(x.stem for x in source.iterdir() if x.suffix == ".json")
             found = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
         self._made = partial(CLaw, source, name=name, compiler=compiler)
         if not found:
@@ -298,7 +293,7 @@ class CLaw:
 
     def _call(self, t: float, *arguments: object) -> None:
         """Call the C code at time t [s], or raise `InputError` if an argument is invalid."""
-        if self._step(*arguments) == _INVALID:
+        if self._step(*arguments) == 2:  # the status INVALID
             raise InputError(
                 f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
                 "finite or too large"
@@ -334,9 +329,10 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     names, units = law.inputs
     kind, title = "state" if state else "output", f"{law.title} of '{robot.name}'"
     frame = state.frame if state else lin.frame if lin else ""
-    # In single precision, the accepted relative error is the unit roundoff 2^-24 times the number
-    # of operations.
-    error = _DOUBLE_ERROR if real == "double" else law.operations * 2.0**-24
+    # Largest rounding error that the test program accepts, relative to `Case.scale`, the sum of the
+    # magnitudes of the terms. In single precision, the error is the unit roundoff 2^-24 times the
+    # number of operations.
+    error = 1e-14 if real == "double" else law.operations * 2.0**-24
     bounds = error * np.max([case.scale for case in law.cases], axis=0)
     sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
     array = partial(_array, real=real)
@@ -404,7 +400,7 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
         words |= {
             "sample_argument": "unsigned long sample, ",
             "sample_given": "given->sample, ",
-            "sample_comment": "sample counts sample times from the start, 0.",
+            "sample_comment": f" sample counts from 0; the last row applies from {rows - 1} on.",
             "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
             "feedback": "feed_back((int)row, 1, x, u);",
         }
@@ -413,7 +409,7 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
         words |= {
             **{"axis_count": axes, "axis_room": room, "corners": 2**axes},
             "feedback": "feed_back_between(measured, x, u);",
-            "gains_between": ", K interpolated linearly between joint angles",
+            "gains_between": ", K interpolated linearly between joint angles, constant outside",
         }
     return words
 

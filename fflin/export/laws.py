@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+import pinocchio as pin
 from numpy.linalg import norm
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
-from fflin.control.gain import Gain, own_model
+from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
@@ -92,12 +93,13 @@ def law_of(given: object, robot: object, limits: object) -> Law:
         # A law that was read from a file contains only the robot's name, which `load` may know.
         with suppress(FflinError):
             robot = load(lin.robot if lin else getattr(given, "robot", ""))
-    if robot is None:
+    robot = instance("robot", robot, (Robot, type(None)), "a Robot")
+    sha256 = getattr(lin or given, "urdf_sha256", robot and robot.urdf_sha256)
+    if robot is None or robot.urdf_sha256 != sha256:
         raise InputError(
-            f"the robot of this {type(given).__name__} is not known, and the C code depends on "
-            "its continuous joints; give the robot with robot= (--robot)"
+            f"the robot of this {type(given).__name__} is not known, or the robot of this name has "
+            "another URDF or other masses; give the robot of the design with robot= (--robot)"
         )
-    robot = instance("robot", robot, Robot, "a Robot")
     law = _output_law(given, robot) if isinstance(given, OfOutputs) else _state_law(given, robot)
     high = np.full(len(law.inputs[0]), np.inf)
     low = -high
@@ -121,7 +123,9 @@ def _state_law(given: OfStates, robot: Robot) -> Law:
         tables = _samples(given, state)
     else:
         if isinstance(given, Gain):
-            dt, given = given.dt, StateFeedback(given._lin or own_model(given, robot), given.K)
+            made = f"the gain was designed for '{given.robot}'"
+            own = given._lin or model_of(given, robot, made, pin.XYZQUATToSE3(given.placement))
+            dt, given = given.dt, StateFeedback(own, given.K)
         else:
             dt = given.lin.dt
         lin = given.lin

@@ -39,6 +39,10 @@ def wheeled(_):
     return free_body((20.0, 30.0, 40.0)).replace(inputs=[wheel])
 
 
+def flexible(_):
+    return fflin.load("inspector_flexible.toml")
+
+
 def arm(_):
     return fflin.load("ets_vii")
 
@@ -84,7 +88,9 @@ def defined(job, target, q, nu, u, stop):
 
 
 def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
-    for made, frame, follows in itertools.product((turning, wheeled), FRAMES, (False, True)):
+    for made, frame, follows in itertools.product(
+        (turning, wheeled, flexible), FRAMES, (False, True)
+    ):
         robot, rng = made(tmp_path), np.random.default_rng(3)
         options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
         job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", options)

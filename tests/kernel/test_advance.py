@@ -159,10 +159,11 @@ def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_own_frame():
 
 @pytest.mark.parametrize("angle", [3.0, -3.0])
 def test_the_angle_of_a_continuous_joint_is_read_on_the_turn_of_the_target(robots, angle):
-    robot = plain(robots["ets_vii"])
-    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_1": angle}))
+    robot = plain(robots["planar_detumble"])
+    targets = {"joint_1": angle, "joint_2": -angle}
+    lin = fflin.linearize(robot, fflin.configuration(robot, targets))
     policy, x0 = fflin.StateFeedback(lin, fflin.lqr(lin).K), lin.x0.copy()
-    x0[6] += np.copysign(0.5, angle)
+    x0[6:8] += np.copysign(0.5, (angle, -angle))
     (_, _, u, *_), _ = both(planned(robot, policy, x0=x0, dt=0.02, duration=0.2))
     assert u[0] == pytest.approx(lin.u0 - policy.K @ (x0 - lin.x0), rel=1e-10, abs=1e-12)
 

@@ -23,7 +23,7 @@ static const ${name}_real y0[${NAME}_OUTPUTS] = $y0;
 static const ${name}_real low[${NAME}_INPUTS] = $low;
 static const ${name}_real high[${NAME}_INPUTS] = $high;
 
-/* Whether an output is the angle of a continuous joint. */
+/* 1 for each output that is the angle of a continuous joint, else 0. */
 static const int continuous[${NAME}_OUTPUTS] = $continuous;
 
 static int is_finite(${name}_real value)

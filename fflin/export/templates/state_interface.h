@@ -2,7 +2,7 @@
 #define ${NAME}_JOINTS_MAX $joints_max
 #define ${NAME}_STATES $states
 
-/* What is measured. The world is the frame in which the model was made$world.
+/* Measured quantities. World axes are the axes of the base pose in a configuration q of fflin$world.
  * joints[] and joint_rates[], in this order:
 $joint_list
  */
@@ -17,11 +17,13 @@ typedef struct {
 
 /* Write the state x. q_b is the vector part of the quaternion relative to the reference, with
  * scalar part >= 0; the angle of a continuous joint is within half a turn of its target.
+ * The status is OK, or INVALID; then all entries of x are zero.
 $state_list
  */
 int ${name}_state(${sample_argument}const ${name}_measured *measured, ${name}_real x[${NAME}_STATES]);
 
-/* Write the inputs u = u0 - K (x - x0)$gains_between. $sample_comment
+/* Write the inputs u = u0 - K (x - x0)$gains_between.$sample_comment
+ * If the status is INVALID, u is u0 within the limits.
 $input_list
  */
 int ${name}_step(${sample_argument}const ${name}_measured *measured, ${name}_real u[${NAME}_INPUTS]);

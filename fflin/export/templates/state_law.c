@@ -26,10 +26,10 @@ static const ${name}_real K[$gains][${NAME}_INPUTS][${NAME}_STATES] = $K;
 static const ${name}_real low[${NAME}_INPUTS] = $low;
 static const ${name}_real high[${NAME}_INPUTS] = $high;
 
-/* Whether omega_b and v_b are in reference axes; otherwise they are in base axes. */
+/* 1 if omega_b (or v_b) is in reference axes, 0 if it is in base axes. */
 static const int in_reference_axes[2] = $in_reference_axes;
 
-/* Whether a joint is continuous. */
+/* 1 for each continuous joint, else 0. */
 static const int continuous[${NAME}_JOINTS_MAX] = $continuous;
 
 static int is_finite(${name}_real value)
