@@ -59,7 +59,8 @@ class Estimator(ModelDesign):
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
-    robot : str
+    robot, urdf_sha256 : str
+        Name of the robot, and SHA-256 of its URDF.
     estimated : tuple of str (nz,)
         Names of the estimated states; empty if all states are estimated. The entries of L, P and W
         are zero for states that are not estimated.
@@ -122,7 +123,8 @@ class Compensator(ModelDesign):
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
-    robot : str
+    robot, urdf_sha256 : str
+        Name of the robot, and SHA-256 of its URDF.
 
     Examples
     --------

@@ -83,7 +83,8 @@ class GainSchedule(Schedule):
         the sum of the norms of its terms. A sampled schedule has the residual of the Riccati
         difference equation instead.
     state_names, input_names : tuple of str
-    robot : str
+    robot, urdf_sha256 : str
+        Name of the robot, and SHA-256 of its URDF.
     dt : float
         Sampling time [s], over which u is held; 0 for continuous time.
     weights : str
@@ -210,7 +211,8 @@ class FilterSchedule(Schedule):
         Residual of the Riccati difference equation for P, relative to its terms as in
         `GainSchedule`.
     state_names, input_names, output_names : tuple of str
-    robot : str
+    robot, urdf_sha256 : str
+        Name of the robot, and SHA-256 of its URDF.
     dt : float
         Sampling time [s].
 

@@ -149,7 +149,7 @@ def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    """Return the description of C code, or raise `FileError` if code or header were edited."""
+    """Return the description of C code, or raise `FileError` if a file was edited."""
     with reading(path, "description of C code"):
         about: dict[str, Any] = json.loads(path.read_bytes())
         header, code = (path.with_suffix(ending).read_bytes() for ending in (".h", ".c"))
@@ -387,7 +387,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
-    """Return {placeholder: text} for the placeholders that only templates of state laws have."""
+    """Return {placeholder: text} for placeholders that occur only in templates of state laws."""
     n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
     words: dict[str, object] = {
         **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
@@ -406,10 +406,11 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
         }
     if points is not None:
         axes, room = points.shape
+        joints = ", ".join(_plain(state.robot.joint_names[i]) for i in law.tables["axis_joint"])
         words |= {
             **{"axis_count": axes, "axis_room": room, "corners": 2**axes},
             "feedback": "feed_back_between(measured, x, u);",
-            "gains_between": ", K interpolated linearly between joint angles, constant outside",
+            "gains_between": f", K interpolated linearly over {joints}, constant outside",
         }
     return words
 

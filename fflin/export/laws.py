@@ -71,8 +71,7 @@ class Law:
 def measured(world: StateMap, q: Array, v: Array) -> Array:
     """Return the arguments (13 + 2n,) of the C code of a state law at q and v.
 
-    `world` is a state map of the robot, and the reference of this map is the world. q and v are not
-    checked.
+    `world` is a state map of the robot whose reference is the world. q and v are not checked.
     """
     attitude, nu = quaternion_product(world.origin_quaternion, q[3:7]), world.velocities(v)
     pose = attitude, world.positions(q), world.joint_positions(q)

@@ -143,7 +143,10 @@ def test_the_header_names_every_entry(tmp_path):
 
 
 def test_the_code_has_no_state_and_calls_sqrt_alone(tmp_path):
-    source = (fflin.write_c(law("grid")[1], tmp_path) / "controller.c").read_text()
+    by = law("grid")[1]
+    source = (fflin.write_c(by, tmp_path) / "controller.c").read_text()
+    header = (tmp_path / "controller.h").read_text()
+    assert f"K interpolated linearly over {', '.join(by.table()[0])}, constant outside" in header
     assert not re.search(r"^static (?!const|int|void)", source, re.MULTILINE)
     called = set(re.findall(r"\b(\w+)\(", re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)))
     own = set(re.findall(r"^(?:static )?(?:int|void) (\w+)\(", source, re.MULTILINE))
