@@ -304,15 +304,15 @@ class Design(Result):
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
             values = {item.name: _value(item, record[item.name]) for item in _saved(cls)}
-            require_possible(values, getattr(cls, "SHAPES", ""))
+            require_possible(values, getattr(cls, "_SHAPES", ""))
             return cls(**given, **values, verified=verified)
 
 
 def require_possible(values: Record, shapes: str = "") -> None:
     """Raise `ValueError` if values from a file are impossible or contradict each other.
 
-    `shapes` contains a shape ``name:letters`` for some entries, with one letter for each dimension.
-    All dimensions with the same letter must have the same length.
+    `shapes` states the dimensions of arrays, as in ``K:ux x0:x``. A letter stands for one length,
+    which is the same wherever the letter occurs.
     """
     for key, value in values.items():
         if isinstance(value, float) and not (-_LARGEST if key != "dt" else 0) <= value <= _LARGEST:
@@ -325,7 +325,7 @@ def require_possible(values: Record, shapes: str = "") -> None:
     for key, letters in (each.split(":") for each in shapes.split()):
         shape = np.shape(values[key])
         if tuple(map(lengths.setdefault, letters, shape)) != shape or len(shape) < len(letters):
-            raise ValueError(f"{key} has shape {shape}, which does not fit to the other entries")
+            raise ValueError(f"{key} has shape {shape}, which contradicts other entries")
 
 
 def _is_pose(values: Array) -> bool:

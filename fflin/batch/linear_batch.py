@@ -20,7 +20,7 @@ from fflin.base.writing import as_path
 from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
-from fflin.linear.model import LinearModel, OfRobot
+from fflin.linear.model import LinearModel, ModelHeader
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array, Indices, Mask
@@ -35,7 +35,7 @@ _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearBatch(OfRobot):
+class LinearBatch(ModelHeader):
     r"""Batch of linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)``, made by `sweep`.
 
     ``batch[i]`` is the `LinearModel` about point i. ``batch[2:9]`` and ``batch[mask]`` are smaller

@@ -108,7 +108,7 @@ class Gain(ModelDesign):
     True
     """
 
-    SHAPES = "K:ux P:xx Q:xx R:uu N:xu A:xx B:xu x0:x u0:u state_names:x input_names:u"
+    _SHAPES = "K:ux P:xx Q:xx R:uu N:xu A:xx B:xu x0:x u0:u state_names:x input_names:u"
 
     K: Array
     P: Array

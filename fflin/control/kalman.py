@@ -73,6 +73,8 @@ class Estimator(ModelDesign):
     (True, True)
     """
 
+    _SHAPES = "A:xx B:xu C:yx D:yu L:xy P:xx W:xx V:yy x0:x u0:u y0:y state_names:x output_names:y"
+
     L: Array
     L_update: Array
     P: Array
@@ -134,7 +136,7 @@ class Compensator(ModelDesign):
     ((18, 18), True)
     """
 
-    SHAPES = "A:zz B:zy C:uz y0:y u0:u input_names:y output_names:u"
+    _SHAPES = "A:zz B:zy C:uz y0:y u0:u input_names:y output_names:u"
 
     C: Array
     poles: Poles

@@ -104,7 +104,7 @@ class GainSchedule(Schedule):
     >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
     """
 
-    SHAPES = "t:t K:tux P:txx state_names:x input_names:u knots:k q:kq v:kv"
+    _SHAPES = "t:t K:tux P:txx state_names:x input_names:u knots:k q:kq v:kv"
 
     K: Array
     Q: Array

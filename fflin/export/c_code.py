@@ -80,8 +80,8 @@ def write_c(
     limits : "urdf", float, mapping or list, optional
         Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
-        Prefix of the file names and of all names in the C code. A program can include headers of
-        two laws only if their names differ in more than upper and lower case.
+        Prefix of the file names and of all names in the C code. A program cannot include the
+        headers of two laws whose names differ only in upper and lower case.
     real : {"double", "float"}
         Floating-point type of the C code.
 

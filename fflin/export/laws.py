@@ -93,11 +93,11 @@ def law_of(given: object, robot: object, limits: object) -> Law:
         with suppress(FflinError):
             robot = load(lin.robot if lin else getattr(given, "robot", ""))
     robot = instance("robot", robot, (Robot, type(None)), "a Robot")
-    sha256 = getattr(lin or given, "urdf_sha256", robot and robot.urdf_sha256)
-    if robot is None or robot.urdf_sha256 != sha256:
+    if robot is None or (own := robot.urdf_sha256) != getattr(lin or given, "urdf_sha256", own):
+        said = f"has another URDF or other masses than '{robot.name}'" if robot else "is not known"
         raise InputError(
-            f"the robot of this {type(given).__name__} is not known, or the robot of this name has "
-            "another URDF or other masses; give the robot of the design with robot= (--robot)"
+            f"the robot of this {type(given).__name__} {said}; give the robot of the design with "
+            "robot= (--robot)"
         )
     law = _output_law(given, robot) if isinstance(given, OfOutputs) else _state_law(given, robot)
     high = np.full(len(law.inputs[0]), np.inf)

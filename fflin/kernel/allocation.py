@@ -219,7 +219,8 @@ def solve(problem, size, lane):
     last = count * size
     unit = root(row_product(A, 0, A, 0, last))
     force = root(row_product(A, last, A, last, size))
-    force = unit if force == 0.0 else force  # bounds may exclude zero
+    # Also if no force is wanted, inputs whose bounds exclude zero must be balanced by others.
+    force = unit if force == 0.0 else force
     nothing = not (unit > 0.0 and force > 0.0)
     scale = 1.0 if nothing else unit / force
     free = 0

@@ -81,7 +81,7 @@ class SignalNames(StatesAndInputs):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OfRobot(SignalNames):
+class ModelHeader(SignalNames):
     """Frame, robot and package versions for which linear models were computed."""
 
     frame: Frame
@@ -109,7 +109,7 @@ class StateSpace(SignalNames):
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
-class LinearModel(OfRobot, StateSpace):
+class LinearModel(ModelHeader, StateSpace):
     r"""Linear model about an operating point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. If ``dt > 0``, the model is in discrete

@@ -187,6 +187,8 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, tmp_path):
         ("schedule", {"K": np.zeros((2, 6))}, "K has shape"),
         ("schedule", {"K": np.zeros((3, 6, 13))}, "shape"),
         ("schedule", {"t": np.zeros(2)}, "shape"),
+        ("estimator", {"L": np.zeros((3, 3))}, "L has shape"),
+        ("estimator", {"C": np.zeros((30, 3))}, "shape"),
         ("compensator", {"A": np.zeros(3)}, "A has shape"),
         ("compensator", {"C": np.zeros((8, 15))}, "shape"),
         ("compensator", {"y0": np.zeros(3)}, "shape"),

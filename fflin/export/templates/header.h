@@ -9,8 +9,9 @@
  * Sample time: $sample_time
  * Numbers: $real
  *
- * No memory is allocated, there is no global variable, every loop has a fixed bound, and no function
- * of the C library except $sqrt is called. Calls with different arguments may run at the same time.
+ * No memory is allocated, there is no global variable, every loop has a fixed bound, and no
+ * function of the C library except $sqrt is called. Calls with different arguments may run at the
+ * same time.
  *
  * The test program ${name}_test.c compares $count cases with fflin. In each case, a result may
  * differ by $error times the sum of the absolute values of its terms, which allows for

@@ -2,7 +2,7 @@
 #define ${NAME}_JOINTS_MAX $joints_max
 #define ${NAME}_STATES $states
 
-/* Measured quantities. World axes are the axes of the base pose in a configuration q of fflin$world.
+/* Measured quantities. World: the frame relative to which fflin gives the pose of the base$world.
  * joints[] and joint_rates[], in this order:
 $joint_list
  */
@@ -17,7 +17,7 @@ typedef struct {
 
 /* Write the state x. q_b is the vector part of the quaternion relative to the reference, with
  * scalar part >= 0; the angle of a continuous joint is within half a turn of its target.
- * The status is OK, or INVALID; then all entries of x are zero.
+ * The status is OK or INVALID. If it is INVALID, x is zero.
 $state_list
  */
 int ${name}_state(${sample_argument}const ${name}_measured *measured, ${name}_real x[${NAME}_STATES]);
