@@ -18,11 +18,13 @@ from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.policies import StateFeedback
+from fflin.dynamics.integrators import CommutatorFree4, held_exponential
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
+from fflin.simulation.pace import Pace, Poles
 from fflin.simulation.run import STOPS
 
 # A run has settled if its error is at most SETTLED times the initial error, and diverged if its
@@ -148,8 +150,14 @@ class Loop:
         fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
         horizon = (_CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)) / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
-        every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
-        dt = lin.dt / every if lin.dt else _STEP / pace
+        # The step must also be short enough for the damping of all modes.
+        matrices = [free.A] if lin.dt else [free.A, self.rate]
+        poles = [Poles("robot and the loop", np.linalg.eigvals(each)) for each in matrices]
+        dt, _ = Pace(poles, CommutatorFree4, horizon).step(_STEP / pace)
+        every = 1
+        if lin.dt:
+            every = math.ceil(lin.dt / dt)
+            dt = lin.dt / every
         if not horizon / dt <= _MOST_STEPS:
             raise InputError(
                 f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
@@ -171,17 +179,11 @@ class Loop:
     def _transition(self, dt: float, every: int) -> Array:
         """Return the transition matrix of the linear loop from one check to the next.
 
-        In a sampled loop, there is one check per sample, and the matrix is A - B K. In a continuous
-        loop, the matrix is computed with the steps of the integrator CF4. For a linear system, CF4
-        equals the classical Runge-Kutta method: each step multiplies the state by the fourth-order
-        Taylor polynomial of the matrix exponential. Because the linear loop uses the same
-        polynomial, only nonlinear terms can cause a difference from the simulated loop.
+        In a sampled loop, there is one check per sample, and the matrix is A - B K.
         """
         if self.lin.dt:
             return self.rate
-        one, Z = np.eye(len(self.rate)), self.rate * dt
-        step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
-        return np.linalg.matrix_power(step, every)
+        return held_exponential(self.rate, np.zeros((len(self.rate), 0)), dt * every)[0]
 
     def _is_over(self, first: Array, e: Array) -> Mask:
         """Return the mask (N,) of settled or diverged runs.

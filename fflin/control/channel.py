@@ -82,7 +82,6 @@ def saturation(
         on_off=on_off,
         most=most,
         least=least,
-        quantum=np.where(on_off, most * dt, 1.0),
         time=time,
     )
     return within._replace(pulses=pulses)

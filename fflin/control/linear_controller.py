@@ -198,8 +198,13 @@ class LinearController(Feedback):
     def loop(self) -> Array:
         """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
         lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
+        return self.loop_around(lin)
+
+    def loop_around(self, lin: LinearModel) -> Array:
+        """Return the closed-loop matrix of the controller and another model with its signals."""
         both, K, _ = self.around(lin)
-        return both.A + both.B @ K
+        loop: Array = both.A + both.B @ K
+        return loop
 
     def sampled(self, dt: float) -> LinearController:
         """Return the controller sampled at dt [s]; a sampled controller is unchanged."""

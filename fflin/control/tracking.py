@@ -226,20 +226,15 @@ def tracking_of(policy: object) -> TrajectoryFeedback | None:
 
 
 @lru_cache(maxsize=2)  # saves half the time of a short run
-def largest_rate(schedule: GainSchedule) -> float:
-    """Return the 95th percentile over time of the magnitude [1/s] of the fastest closed-loop pole.
+def poles_along(schedule: GainSchedule) -> Array:
+    """Return the poles [1/s] of the robot and of the closed loop at all times of a schedule.
 
-    Return 0 for a sampled schedule.
+    Return an empty array for a sampled schedule.
     """
-    # The percentile excludes the short time at the end during which a large final weight makes K
-    # large. An integration step that is based on the percentile may be too long for this time.
     if schedule.dt:
-        return 0.0
-    rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
-    held, rates = np.diff(schedule.t), np.maximum(rates[1:], rates[:-1])
-    order = rates.argsort()
-    passed = np.searchsorted(held[order].cumsum(), 0.95 * held.sum())
-    return float(rates[order][min(int(passed), len(rates) - 1)])
+        return np.zeros(0)
+    systems = (schedule.A, schedule.A - schedule.B @ schedule.K)
+    return np.concatenate([np.linalg.eigvals(A).ravel() for A in systems])
 
 
 @dataclass(eq=False)

@@ -1,6 +1,7 @@
 """Integrators: fixed steps on the configuration manifold, and exact sampling of linear models."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, TypeAlias
@@ -21,7 +22,7 @@ def integrate_rows(model: pin.Model, q: Array, way: Array) -> Array:
     return np.array([*map(partial(_integrate, model), q, way)])
 
 
-class Integrator:
+class Integrator(ABC):
     """Integrator of one model with a fixed step size, for one q and v, or for N rows of q and v."""
 
     # A step of length h starts at q and v. The accelerations at its stages are l1, l2, and so on.
@@ -66,6 +67,15 @@ class Integrator:
         speed[:, 1:] *= dt
         return displacement, speed
 
+    @classmethod
+    @abstractmethod
+    def growth(cls, z: Array) -> Array:
+        """Return ln|R(z)| for poles times the step, z = lambda h.
+
+        A step multiplies the amplitude of the mode with the pole lambda by |R(z)|. The exact factor
+        is exp(Re z).
+        """
+
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later; `f(t, q, v)` returns the acceleration."""
         model, stages, begins = self.model, self._stages, list[Array]()
@@ -107,6 +117,14 @@ class CommutatorFree4(Integrator):
         (1.0, *weights),
     )
 
+    @classmethod
+    def growth(cls, z: Array) -> Array:
+        """Return ln|R(z)| with the Taylor polynomial R of order 4; see `Integrator.growth`."""
+        R = 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
+        with np.errstate(divide="ignore"):
+            growth: Array = np.log(np.abs(R))
+        return growth
+
 
 class SemiImplicitEuler(Integrator):
     """Semi-implicit Euler method of order 1: the new velocity displaces the configuration."""
@@ -115,6 +133,21 @@ class SemiImplicitEuler(Integrator):
     reach = 2.0
     origins = (0,)
     displacements, speeds = ((1.0, 1.0), (0.0, 0.0)), ((1.0, 1.0),)
+
+    @classmethod
+    def growth(cls, z: Array) -> Array:
+        """Return ln|R(z)|; see `Integrator.growth`.
+
+        For a complex pole, R is the larger eigenvalue of the step of the oscillator with the
+        characteristic polynomial s^2 - 2 Re(z) s + |z|^2. For a real pole, R = 1 + z.
+        """
+        determinant = 1.0 + 2.0 * z.real
+        half_trace = 0.5 * (1.0 + determinant - np.abs(z) ** 2)
+        root = np.sqrt((half_trace**2 - determinant).astype(complex))
+        pair = np.maximum(np.abs(half_trace + root), np.abs(half_trace - root))
+        with np.errstate(divide="ignore"):
+            growth: Array = np.log(np.where(z.imag == 0.0, np.abs(1.0 + z.real), pair))
+        return growth
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {
@@ -128,6 +161,17 @@ def integrator(name: str) -> type[Integrator]:
     if str(name) not in INTEGRATORS:
         raise unknown("method", str(name), INTEGRATORS)
     return INTEGRATORS[str(name)]
+
+
+def integrated_hold(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
+    """Return the two matrices of `held_exponential` as a step of `CommutatorFree4` computes them.
+
+    For a linear system, CF4 is the classical Runge-Kutta method: its matrices are Taylor
+    polynomials.
+    """
+    one, Z = np.eye(len(A)), A * h
+    mean = one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0))
+    return one + Z @ mean, h * mean @ driven
 
 
 # Commutator-free method of order four (10.3): its two Gauss points, and the weights alpha (HEAVY)

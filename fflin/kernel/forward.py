@@ -95,12 +95,18 @@ def joint_position(robot, q, joint):
 
 
 def apply_faults(
-    faults: ActuatorFaults, triads: list[int], t: float, u: Entries, given: Entries
+    faults: ActuatorFaults, triads: list[int], t: float, h: float, u: Entries, given: Entries
 ) -> None:
-    """Write to `given` the inputs that the actuators produce for a command u at a time t [s]."""
+    """Write to `given` the inputs that the actuators produce for a command u in a step.
+
+    The step begins at time t [s] and lasts h [s]. If an actuator fails within the step, its mean
+    output acts during the step, so that the impulse is exact.
+    """
     for index in range(len(faults.gain)):
         value = load(faults.gain, index) * load(u, index) + load(faults.bias, index)
-        store(given, index, chosen(t, load(faults.until, index), value, 0.0))
+        left = (load(faults.until, index) - t) / h
+        fraction = chosen(left, 1.0, left, 1.0)
+        store(given, index, chosen(0.0, left, fraction * value, 0.0))
     for index in range(len(triads)):
         at, columns = triads[index], vec.get_columns(faults.turn, 9 * index)
         vec.put3(given, at, vec.product(columns, vec.get3(given, at)))

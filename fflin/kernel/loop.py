@@ -15,7 +15,7 @@ from fflin.kernel.allocation import allocate
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, store, whole
+from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, store
 
 
 class Wheels(
@@ -33,16 +33,17 @@ class Wheels(
     """
 
 
-class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
+class Pulses(namedtuple("Pulses", "at on_off most least left level end time")):
     """Pulsed thrusters (k,): one pulse per sample delivers the commanded impulse.
 
     - `at`: index of the thruster's input. `on_off`: True if the thrust is either 0 or `most`, False
       if the thrust can have any value from 0 to `most`.
     - `most` [N]: largest thrust. `least` [N s]: least impulse of a pulse.
-    - `quantum` [N s]: the impulse of an on-off thruster in one step; unused for other thrusters.
     - `left` [N s]: the commanded impulse that was not fired. It is added to the commanded impulse
       of the next sample.
-    - `level` [N]: the thrust of the latest pulse. `end`: the first step after the latest pulse.
+    - `level` [N]: the thrust of the latest pulse. `end`: the time at which the latest pulse ends,
+      in steps. If a pulse ends within a step, its mean thrust acts during this step, so that the
+      impulse is exact.
     - `time` [s]: the sample time.
     """
 
@@ -120,8 +121,8 @@ def transmit(channel: Channel, step: int, nu: Entries, u: Entries) -> None:
         vec.copy(channel.held, 0, u, 0, count)
         pulses = channel.pulses
         for index in range(len(pulses.at)):
-            level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
-            store(u, pulses.at[index], level)
+            fraction = clipped(load(pulses.end, index) - float(step), 0.0, 1.0)
+            store(u, pulses.at[index], fraction * load(pulses.level, index))
     # Reduce the torque of a wheel so far that the wheel does not exceed a speed limit in this step.
     # If the wheel already exceeds a speed limit, the torque is at most reduced to zero, and is not
     # reversed.
@@ -146,13 +147,14 @@ def _begin_pulses(channel, step, u):
         most, least = load(pulses.most, index), load(pulses.least, index)
         command = load(u, pulses.at[index])
         wanted = chosen(most, command, most, command) * pulses.time + load(pulses.left, index)
+        mean = clipped(wanted / pulses.time, 0.0, most)
+        fired = mean * pulses.time
         if pulses.on_off[index]:
-            quantum = load(pulses.quantum, index)
-            length = clipped(whole(wanted / quantum), 0.0, float(sample))
-            level, fired = most + 0.0 * wanted, length * quantum
+            level = most + 0.0 * mean
+            length = float(sample) * mean / most
         else:
-            level = clipped(wanted / pulses.time, 0.0, most)
-            length, fired = float(sample) + 0.0 * wanted, level * pulses.time
+            level = mean
+            length = float(sample) + 0.0 * mean
         # With the tolerance 1e-9, a thruster also fires if only a rounding error makes the impulse
         # smaller than the least impulse.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
@@ -299,7 +301,7 @@ def advance(words, clock, last, every, rows, work):
                     command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
                     allocate(law.allocation, point, law.u)
                 transmit(channel, step, point.nu, point.u)
-            forward.apply_faults(robot.faults, robot.triads, t, point.u, point.pushing)
+            forward.apply_faults(robot.faults, robot.triads, step * h, h, point.u, point.pushing)
             forward.turn_held(robot, point)
             if stage == 0:
                 vec.copy(point.u, 0, method.u, 0, len(point.u))

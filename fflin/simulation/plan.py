@@ -20,7 +20,7 @@ from fflin.base.validation import Array, ArrayLike, instance, number, truth, vec
 from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
-from fflin.control.tracking import followed, largest_rate, tracking_of
+from fflin.control.tracking import followed, tracking_of
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
@@ -28,6 +28,7 @@ from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.robot import Robot
+from fflin.simulation.pace import Pace, Signal, limits_of_step
 from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
@@ -37,7 +38,6 @@ Limits: TypeAlias = "float | str | Mapping[str, object] | Sequence[object]"
 # SHORTEST and LONGEST are the bounds [s] of an automatic duration. The duration is determined by a
 # linear simulation. If the loop is in continuous time, the simulation has the time step _LOOK [s].
 SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
-_STEP = 0.01  # [s] default time step
 # The inputs of a trajectory may jump at the knots of the trajectory. In this case, the last stage
 # of each step is evaluated slightly early, by this fraction of the step. So the stage does not
 # include an input jump at the end of the step.
@@ -107,13 +107,12 @@ class Plan:
 
     def __init__(self, options: SimulationOptions) -> None:
         robot = instance("robot", options.robot, Robot, "a fflin.Robot; fflin.load makes one")
+        self.events = _functions(options)
         policy = followed(options.policy, robot)
         self.options = options
-        self.times = times = times_of(policy, options)
-        policy = followed(policy, robot, held=times.sample * times.dt)
+        duration = duration_of(policy, options)
         state = _state_of(policy, options)
         self.plant = plant = Plant(state, options.disturbance)
-        self.policy: object = policy
         self.method = integrator(options.method)
         (lin, _), follows = feedback_of(policy), getattr(decider(policy), "reference", None)
         follows = follows if callable(follows) else None
@@ -123,15 +122,16 @@ class Plan:
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
-        expected = "a list of functions event(t, q, v)"
-        self.events = tuple(instance("events", options.events, Sequence, expected))
-        functions: list[tuple[str, object, str]] = [("event", x, "(t, q, v)") for x in self.events]
-        functions.append(("callback", options.callback, "(t, q, v, u)"))
-        functions.append(("disturbance", options.disturbance, "(t, q, v)"))
-        for name, given, arguments in functions:
-            if not callable(given) and (given is not None or name == "event"):
-                kind = type(given).__name__
-                raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+        sample = sample_of(policy, options.sample)
+        u = _inputs_at_start(policy, plant)
+        limits = limits_of_step(plant, policy, self.q, self.v, u, sample or 0.0)
+        if options.disturbance is not None:
+            disturbance = partial(plant.disturbing, q=self.q, v=self.v)
+            limits.append(Signal.of("the disturbance", disturbance, options.dt, duration))
+        pace = Pace(limits, self.method, duration)
+        self.times = times = times_of(options, duration, sample, pace)
+        policy = followed(policy, robot, held=times.sample * times.dt)
+        self.policy: object = policy
         # {state or input: (least, largest)}: the limits that saturation enforces.
         self.acting = chosen_limits(robot, options.limits)
         self.limits = saturation(
@@ -140,7 +140,8 @@ class Plan:
         # `initial` (nu,) are the inputs that act until the first command arrives. Without a law,
         # these inputs act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
-        self.initial = _initial_inputs(policy, plant, self.limits)
+        _warn_beyond_limits(policy, plant, self.limits)
+        self.initial = _inputs_at_start(policy, plant)
         # `target` is the target state (nx,) or None. `reference` is a function of time that returns
         # q, v and u of the motion that the policy follows, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
@@ -156,12 +157,6 @@ class Plan:
         # Whether each step ends with a correction that sets momentum and centre of mass to their
         # predicted values. In orbit, momentum is not conserved, so there is no correction.
         self.project = truth("project", options.project) and robot.orbit is None
-        # Indices in v of the rates that end the run if the rotation per step exceeds LARGEST_TURN:
-        # the angular velocity of the base, and the rates of all joints that are not prismatic.
-        # Rotors are excluded, because nothing depends on the angle of a rotor.
-        rotors, joints = robot.rotors, robot.joints
-        turning = [x.idx_v for x in joints if not (x.prismatic or x.name in rotors)]
-        self.turning = np.array([3, 4, 5, *turning])
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         self.steered = fed_back(policy)  # states that the policy feeds back, if known
@@ -246,41 +241,78 @@ def _state_of(policy: object, options: SimulationOptions) -> StateMap:
     return StateMap(robot, reference=reference, frame=own_frame if frame is None else frame)
 
 
-def _initial_inputs(policy: object, plant: Plant, limits: Saturation) -> Array:
-    """Return the inputs (nu,) before the first command.
+def _functions(options: SimulationOptions) -> tuple[Event, ...]:
+    """Return the events; raise `InputError` if an option that must be a function is not one."""
+    expected = "a list of functions event(t, q, v)"
+    events = tuple(instance("events", options.events, Sequence, expected))
+    functions: list[tuple[str, object, str]] = [("event", event, "(t, q, v)") for event in events]
+    functions.append(("callback", options.callback, "(t, q, v, u)"))
+    functions.append(("disturbance", options.disturbance, "(t, q, v)"))
+    for name, given, arguments in functions:
+        if not callable(given) and (given is not None or name == "event"):
+            kind = type(given).__name__
+            raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+    return events
 
-    Warn if these inputs exceed the limits. If the policy follows a trajectory, warn if the inputs
-    of the trajectory exceed the limits at any time.
-    """
+
+def _inputs_at_start(policy: object, plant: Plant) -> Array:
+    """Return the reference inputs (nu,) of the policy at the start, or zeros if it has none."""
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
     # With an allocation, the policy's model has other inputs than the robot.
     if lin is not None and lin.input_names == actuation.names:
-        where, inputs, initial = "at its target", lin.u0[None], lin.u0
+        return lin.u0
+    if along is not None and along is policy:
+        return along.reference(0.0)[2]
+    return np.zeros(len(actuation.names))
+
+
+def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> None:
+    """Warn if the reference inputs of a policy exceed the limits.
+
+    If the policy follows a trajectory, warn if its inputs exceed the limits at any time.
+    """
+    actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
+    if lin is not None and lin.input_names == actuation.names:
+        where, inputs = "at its target", lin.u0[None]
     elif along is not None and along is policy:
         where, inputs = "on its trajectory", along.trajectory.u_base
-        initial = along.reference(0.0)[2]
     else:
-        return np.zeros(len(limits.low))
+        return
     units = dict(zip(actuation.names, actuation.units, strict=True))
     warn_beyond(plant.robot.name, where, units, inputs, limits.low, limits.high)
-    return initial
 
 
-def times_of(policy: object, options: SimulationOptions) -> Times:
-    """Derive the times of a simulation from the options and the policy."""
-    duration, dt, every, follows = options.duration, options.dt, options.every, tracking_of(policy)
-    sample, fastest = _pace_of(policy, options.sample)
+def duration_of(policy: object, options: SimulationOptions) -> float:
+    """Return the duration [s]; by default the duration of the followed trajectory."""
+    duration, follows = options.duration, tracking_of(policy)
     if duration is None and follows is None:
         raise InputError("the duration is missing; give duration= in s")
-    duration = _positive("duration", follows.duration if follows and duration is None else duration)
-    delay = number("delay", options.delay)
-    if not 0.0 <= delay < duration:
-        raise InputError(
-            f"delay is {delay:g} s, expected at least 0 and less than the duration of "
-            f"{duration:g} s, so that a command takes effect"
-        )
+    return _positive("duration", follows.duration if follows and duration is None else duration)
+
+
+def sample_of(policy: object, sample: float | None) -> float | None:
+    """Return the sample time [s] of a policy, or None if the policy is continuous.
+
+    The argument `sample` takes precedence over the sample time of the policy.
+    """
+    if sample is not None:
+        return _positive("sample", sample)
+    follows, by = tracking_of(policy), decider(policy)
+    made = by if hasattr(by, "dt") else getattr(by, "lin", None)
+    return getattr(follows.schedule if follows else made, "dt", None) or None
+
+
+def step_of(
+    options: SimulationOptions, duration: float, sample: float | None, pace: Pace
+) -> tuple[float, int, str]:
+    """Return the time step [s], the number of steps, and the mode that makes the step short.
+
+    The text is empty if the step is given or not short. A given step is shortened such that the
+    duration is a whole number of steps.
+    """
+    dt, mode, delay = options.dt, "", options.delay
     if dt is None:
-        dt = _STEP if fastest * _STEP <= 1.0 else float(0.5 ** np.ceil(np.log2(fastest)))
+        dt, mode = pace.step()
         if sample or delay:
             dt = _part_of(sample or delay, dt, duration, delay)
     dt = _positive("the step dt", dt)
@@ -290,16 +322,39 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
             _in_steps("duration", duration, dt)  # raises an error
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
+    return dt, steps, mode
+
+
+def times_of(
+    options: SimulationOptions, duration: float, sample: float | None, pace: Pace
+) -> Times:
+    """Derive the times of a simulation; `sample` is the sample time [s], None if continuous."""
+    every, notes = options.every, list[str]()
+    delay = number("delay", options.delay)
+    if not 0.0 <= delay < duration:
+        raise InputError(
+            f"delay is {delay:g} s, expected at least 0 and less than the duration of "
+            f"{duration:g} s, so that a command takes effect"
+        )
+    dt, steps, mode = step_of(options, duration, sample, pace)
     if sample is None:
         sample = dt if delay else 0.0
-    reach = integrator(options.method).reach
-    if fastest * dt > reach:
+        if delay:
+            notes.append(
+                f"delay= without sample=: the policy is sampled every {dt:g} s, and its commands "
+                "are held"
+            )
+    reach, fastest = integrator(options.method).reach, pace.fastest
+    if fastest and fastest.fastest * dt > reach:
         raise InputError(
-            f"the step dt is {dt:g} s, too large for a loop whose fastest pole is at "
-            f"{fastest:.4g} 1/s; take at most {reach / fastest:.2g} s, or give `sample`"
+            f"the step dt is {dt:g} s, too large for {fastest.fastest_mode}; take at most "
+            f"{reach / fastest.fastest:.2g} s"
         )
+    if mode:
+        notes.append(f"the step is {dt:.3g} s, because {mode} requires it")
+    notes += pace.remarks(dt)
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
-    thinned, part, notes = every is None and steps > _MANY_ROWS, max(samples, 1), list[str]()
+    thinned, part = every is None and steps > _MANY_ROWS, max(samples, 1)
     # If `every` is chosen automatically, rows of a sampled policy are recorded only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
@@ -310,41 +365,33 @@ def times_of(policy: object, options: SimulationOptions) -> Times:
         said = f"a row is recorded every {every} steps, but the controller samples every "
         notes.append(f"{said}{part} steps, so the rows are not a valid trajectory")
     times = Times(dt, steps, every, samples, late, tuple(notes))
-    entries = times.rows * (options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n)
-    if entries > _MOST_ENTRIES or steps > (_ENDLESS if thinned else _MOST_STEPS):
-        raise InputError(
-            f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {times.rows:.3g} "
-            "rows, which is too many; use a larger dt or `every`, or a slower gain if a fast pole "
-            "of the loop requires this step"
-        )
-    if options.dt is None and fastest * _STEP > 1.0 and steps > _MANY_STEPS:
-        warnings.warn(
-            f"the simulation takes long, because the fastest pole of the loop at {fastest:.3g} 1/s "
-            f"requires {steps:,} steps of {dt:.3g} s; give dt=, sample= or a slower gain",
-            FflinWarning,
-            stacklevel=4,
-        )
+    _require_possible(options, times, mode, thinned=thinned)
     return times
 
 
-def _pace_of(policy: object, sample: float | None) -> tuple[float | None, float]:
-    """Return the sample time [s] or None, and the rate [1/s] of the fastest pole or 0.
+def _require_possible(
+    options: SimulationOptions, times: Times, mode: str, *, thinned: bool
+) -> None:
+    """Raise `InputError` if a run has too many steps or rows; warn if it takes long.
 
-    If the argument `sample` is given, return `sample` and 0. For a sampled policy, return its
-    sample time and 0. For a continuous policy, return None and the absolute value of the fastest
-    pole of the closed loop, or None and 0 if this pole is not known.
+    `mode` names the mode that makes an automatic step short, and is empty for other steps.
     """
-    follows, by = tracking_of(policy), decider(policy)
-    if sample is not None:
-        return _positive("sample", sample), 0.0
-    made = by if hasattr(by, "dt") else getattr(by, "lin", None)
-    if sample := getattr(follows.schedule if follows else made, "dt", None):
-        return sample, 0.0
-    if follows:
-        return None, largest_rate(follows.schedule)
-    if (closed := closed_loop(policy)) and not closed[1]:
-        return None, float(np.abs(np.linalg.eigvals(closed[0])).max())
-    return None, 0.0
+    steps, dt = times.steps, times.dt
+    entries = times.rows * (options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n)
+    if entries > _MOST_ENTRIES or steps > (_ENDLESS if thinned else _MOST_STEPS):
+        reason = f"; {mode} requires this step" if mode else ""
+        raise InputError(
+            f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {times.rows:.3g} "
+            f"rows, which is too many{reason}; use a larger dt or `every`, sampled commands "
+            "(sample=), a slower gain, or fewer modes"
+        )
+    if mode and steps > _MANY_STEPS:
+        warnings.warn(
+            f"the simulation takes long, because {mode} requires {steps:,} steps of {dt:.3g} s; "
+            "give dt=, sampled commands (sample=), a slower gain, or fewer modes",
+            FflinWarning,
+            stacklevel=5,
+        )
 
 
 def _in_steps(name: str, time: float, dt: float) -> int:

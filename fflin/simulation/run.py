@@ -43,6 +43,10 @@ Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
+# A disturbance may jump at the time of a step. The times of the stages are rounded into the step,
+# so that all stages are on the same side of the jump.
+ROUNDED_UP, ROUNDED_DOWN = 1.0 + 1e-15, 1.0 - 1e-15
+
 STOPS = ("", "diverged", "left the chart", "stopped")
 
 LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
@@ -78,6 +82,14 @@ class Plant(Aba):
             turn=np.tile(np.eye(3).ravel(), len(self.triads)),
         )
         self._faulty = faults is not None
+        # Start and length [s] of the present step; written by the caller of `stage`.
+        self.step = (0.0, np.inf)
+        # Indices in v of the angular rates: the angular velocity of the base, and the rates of all
+        # joints that are not prismatic. Rotors are excluded, because nothing depends on the angle
+        # of a rotor.
+        rotors = robot.rotors
+        joints = [x.idx_v for x in robot.joints if not (x.prismatic or x.name in rotors)]
+        self.turning = np.array([3, 4, 5, *joints])
         self._columns = state.lift(self.actuation.fixed)
         # True if the generalised force of the inputs is `_columns` @ u, and no other force acts,
         # apart from a disturbance. Mimic joints and modes are excluded.
@@ -93,7 +105,8 @@ class Plant(Aba):
         """
         if self._faulty:
             given = np.empty(len(u))
-            apply_faults(self.faults, self.triads, t, u, given)
+            begin, h = self.step
+            apply_faults(self.faults, self.triads, begin, h, u, given)
             u = given
         if self.actuation.held:  # use R, because the chart is singular at 180 deg
             R, u = self.state.rotation(q), u.copy()
@@ -105,11 +118,9 @@ class Plant(Aba):
         force = self.actuation.columns(self._data, q) @ u
         disturbed = None
         if self.disturbance is not None:
-            name = f"at t = {t:g} s, disturbance(t, q, v)"
-            disturbed = as_double(name, self.disturbance(t, q.copy(), v.copy()))
-            if np.abs(v).max() < _DIVERGED:
-                expected = "a generalised force (nv,) in Pinocchio's order"
-                disturbed = vector(name, disturbed, self.robot.nv, expected)
+            begin, h = self.step
+            within = min(max(t, begin * ROUNDED_UP), (begin + h) * ROUNDED_DOWN)
+            disturbed = self.disturbing(within, q, v)
         rate = self.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
         if self.field:
@@ -117,6 +128,16 @@ class Plant(Aba):
             power = nu.dot(force) - self.robot.springs.damping.dot(nu[6:] ** 2)
             push = np.append(power if disturbed is None else power + v.dot(disturbed), np.zeros(5))
         return rate, push
+
+    def disturbing(self, t: float, q: Array, v: Array) -> Array:
+        """Return the generalised force (nv,) of the disturbance, or raise `InputError`."""
+        assert self.disturbance is not None
+        name = f"at t = {t:g} s, disturbance(t, q, v)"
+        disturbed = as_double(name, self.disturbance(t, q.copy(), v.copy()))
+        if np.abs(v).max() < _DIVERGED:
+            expected = "a generalised force (nv,) in Pinocchio's order"
+            disturbed = vector(name, disturbed, self.robot.nv, expected)
+        return disturbed
 
     def isolated(self, *, driven: bool) -> bool:
         """Return True if no external force acts on the robot.
@@ -313,14 +334,14 @@ class Recording(NamedTuple):
 def go(plan: Plan, hint: str = "") -> Recording:
     """Simulate a plan in Python; the progress bar of a long run shows the text `hint`."""
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
-    dt, project, kept, callback = times.dt, plan.project, Conserved(plan), plan.options.callback
+    dt, kept, callback = times.dt, Conserved(plan), plan.options.callback
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
-    take, stage, wrench = plan.method(plant.robot.model, dt).step, plant.stage, kept.wrench
+    take, stage = plan.method(plant.robot.model, dt).step, plant.stage
     # Function that integrates the state of the policy, or None if the policy has no state.
     follow = getattr(law.policy, "advance", None) if law else None
     weights = plan.method.step_weights(dt)[1]
-    pushed, latest = not plant.isolated(driven=law is not None), plan.last_node * dt
+    pushed = not plant.isolated(driven=law is not None)
     ends = np.cumsum([len(q), len(v), len(plan.initial), 6])
     rows, at, t, stages = np.empty((times.rows, ends[-1] + 3)), list[float](), 0.0, 0
 
@@ -336,7 +357,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
         # of a continuous policy are computed again.
         a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
         if pushed:
-            kept.wrenches[stages][:] = wrench(q, push)
+            kept.wrenches[stages][:] = kept.wrench(q, push)
         stages += 1
         if follow:
             follow(weights[stages - 1, : stages + 1], stages == len(weights))
@@ -348,12 +369,13 @@ def go(plan: Plan, hint: str = "") -> Recording:
             u = applied(step, t, q, v) if applied else plan.initial
             if step % times.every == 0:
                 record()
-            stages, last = 0, t + latest
+            stages, last = 0, t + plan.last_node * dt
+            plant.step = (t, dt)
             q, v = take(acceleration, t, q, v)
             if pushed:
                 kept.advance()
             t = (step + 1) * dt
-            if project:
+            if plan.project:
                 kept.impose(t, q, v)
             if stopped := ending(t, q, v):
                 break
@@ -367,14 +389,19 @@ def go(plan: Plan, hint: str = "") -> Recording:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
         record()
-    q_of, v_of, u_of, momentum, center = np.split(rows[: len(at)], ends, axis=1)
-    return Recording(np.array(at), q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
+    return Recording(
+        np.array(at),
+        *np.split(rows[: len(at)], ends, axis=1),
+        steps=step + 1,
+        stopped=stopped,
+        engine="python",
+    )
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
     """Return the stop conditions of a run; `squares` has the squared limits of the entries of v."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
-    squares[plan.turning] = plan.times.slow
+    squares[plan.plant.turning] = plan.times.slow
     # If the policy has a linear model, the run ends when the base leaves the attitude chart.
     charted = feedback_of(plan.policy)[0] is not None
     sign = float(np.sign(plan.plant.state.scalar(plan.q))) if charted else 0.0
@@ -409,7 +436,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
             return ""
         if goes_on(anywhere, origin, place, rates):
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
-        dt, turn = plan.times.dt, float(np.abs(v[plan.turning]).max()) * plan.times.dt
+        dt, turn = plan.times.dt, float(np.abs(v[plan.plant.turning]).max()) * plan.times.dt
         detail = f": a joint or the base rotates by {turn:.2g} rad per step"
         known = LARGEST_TURN <= turn <= _LARGEST_SHOWN
         return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"

@@ -199,12 +199,14 @@ def test_a_command_becomes_pulses_of_the_same_impulse():
         robot, lambda t, q, v: told[round(t / 0.1)], duration=20.0, dt=0.01, sample=0.1
     )
     thrust = motion.u[:-1, 0].reshape(200, 10)
-    assert set(thrust.ravel()) == {0.0, 2.0}
-    # One pulse from the beginning of each sample.
+    # One pulse from the beginning of each sample. Its last step has the mean thrust of this step.
     assert (np.diff(thrust, axis=1) <= 0.0).all()
-    given = np.cumsum(thrust.sum(axis=1) * 0.01)
-    asked = np.cumsum(np.clip(told[:, 0], 0.0, 2.0) * 0.1)
-    assert np.abs(given - asked).max() <= 0.5 * 2.0 * 0.01 + 1e-12
+    partial = (thrust > 0.0) & (thrust < 2.0)
+    assert partial.sum(axis=1).max() == 1
+    given = thrust.sum(axis=1) * 0.01
+    asked = np.clip(told[:, 0], 0.0, 2.0) * 0.1
+    np.testing.assert_allclose(given, asked, rtol=0.0, atol=1e-14)
+    given = given.cumsum()
     np.testing.assert_array_equal(motion.u[:-1:10, 1:], told[:, 1:])
     assert robot.mass * motion.v[-1, :3] @ [1, 0, 0] < given[-1]
     assert motion.momentum_drift.max() < 1e-13
@@ -218,7 +220,7 @@ def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
         robot, lambda t, q, v: [0.2], duration=2.0, dt=0.01, sample=0.1, limits="urdf"
     )
     impulse = motion.u[:-1, 0].reshape(20, 10).sum(axis=1) * 0.01
-    # 0.02 N s a sample: fired at the third (0.06), and so on; in steps of 0.02 N s where on-off.
+    # 0.02 N s a sample: fired at the third (0.06), and so on.
     assert set(np.round(impulse, 12)) == {0.0, 0.06}
     assert np.flatnonzero(impulse).tolist() == [2, 5, 8, 11, 14, 17]
     if on_off:
@@ -257,7 +259,7 @@ def test_the_linear_model_foresees_pulses():
         options = {} if model.dt else {"sample": 0.1}
         policy = fflin.StateFeedback(model, K)
         motion = fflin.simulate(robot, policy, x0=x0, duration=5.0, limits="urdf", **options)
-        assert set(motion.u[:, 0]) == {0.0, 1.0}
+        assert set(motion.u[:, 0]) > {0.0, 1.0}
         np.testing.assert_allclose(motion.linear, motion.x, atol=1e-9)
 
 

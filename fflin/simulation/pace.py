@@ -1,0 +1,410 @@
+"""The time step of a simulation, chosen from the poles of the robot and of the closed loop.
+
+In a step of h [s], an integrator multiplies the amplitude of a mode with the pole lambda by |R|,
+with R = R(lambda h). The exact factor is exp(Re lambda h). A step is short enough for a mode if it
+changes the damping of the mode by at most 5 %, or the amplitude over the run by at most 1 %:
+
+    |ln|R| - Re(lambda) h| <= max(0.05 |Re(lambda)| h, 0.01 h / T)                          (11.6)
+
+T is the duration of the run. The step must be short enough for all modes of the robot with constant
+inputs, and for all modes of the closed loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.names import group_of
+from fflin.base.validation import Array, Values
+from fflin.control.channel import Law
+from fflin.control.linear_controller import LinearController, closed_loop
+from fflin.control.policies import bound, decider, feedback_of
+from fflin.control.tracking import poles_along, tracking_of
+from fflin.dynamics.integrators import CommutatorFree4, Integrator, integrated_hold
+from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
+from fflin.robot.outputs import FullState
+from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
+
+ROBOT = "robot"  # name of the robot with constant inputs, in messages
+LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
+_DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.6)
+_SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
+
+# A pole of a sampled loop below this magnitude decays within two samples. The step hardly matters
+# to such a pole, and its logarithm has large rounding errors.
+_VANISHING = 0.1
+
+# Displacements of the state from which the derivatives of a policy are estimated. If both
+# displacements give the same derivatives up to the relative difference _SMOOTH, the policy is
+# differentiable.
+_DISPLACEMENTS, _SMOOTH = (1e-6, 1e-5), 0.05
+
+# A step resolves a function of time if a parabola through its values at the three stages of the
+# step is accurate to _PARABOLA times the largest value. This is compared at the fractions _BETWEEN
+# of the step, in _WINDOWS steps of the run. _HALVINGS is the largest number of times that the step
+# is halved for a function of time. A function that jumps between steps is never resolved.
+_PARABOLA, _BETWEEN, _WINDOWS, _HALVINGS = 0.02, (0.2, 0.35, 0.7, 0.85), 16, 7
+
+
+class Demand(NamedTuple):
+    """Step error of one mode: the ratio of the left to the right side of (11.6), and the mode."""
+
+    error: float
+    mode: Callable[[], str]
+
+
+class Limit(Protocol):
+    """Something that limits the step, such as the poles of the robot."""
+
+    def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
+        """Return the largest step error (11.6) of a step of h [s]."""
+        ...
+
+
+def step_error(exact: Array, simulated: Array, h: float, duration: float) -> Array:
+    """Return the ratio of the left to the right side of (11.6), for each mode.
+
+    `exact` and `simulated` are the logarithms of the exact and of the simulated factor by which the
+    amplitude changes in h [s].
+    """
+    tolerance = np.maximum(_DAMPING * np.abs(exact), _AMPLITUDE * h / duration)
+    error: Array = np.abs(simulated - exact) / tolerance
+    return np.nan_to_num(error, nan=np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Poles [1/s] of the robot or of a continuous closed loop.
+
+    `system` is the name of the system in messages. `A` is the matrix whose eigenvalues are the
+    poles, and `state_names` are the names of its states. If A is not known, the names are empty.
+    """
+
+    system: str
+    poles: Values
+    A: Array | None = None
+    state_names: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, system: str, A: Array, state_names: tuple[str, ...]) -> Poles:
+        """Return the poles of a matrix A (n, n)."""
+        return cls(system, np.linalg.eigvals(A), A, state_names)
+
+    def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
+        """Return the largest step error; see `Limit`."""
+        if not len(self.poles):
+            return Demand(0.0, str)
+        z = self.poles * h
+        errors = step_error(z.real, method.growth(z), h, duration)
+        worst = int(errors.argmax())
+        return Demand(float(errors[worst]), lambda: self.mode(worst))
+
+    @property
+    def fastest(self) -> float:
+        """Largest magnitude [1/s] of the poles."""
+        return float(np.abs(self.poles).max(initial=0.0))
+
+    @property
+    def fastest_mode(self) -> str:
+        """Text that names the mode of the fastest pole."""
+        return self.mode(int(np.abs(self.poles).argmax()))
+
+    def mode(self, index: int) -> str:
+        """Return a text that names the mode of a pole, such as its frequency and its main state."""
+        pole = complex(self.poles[index])
+        size = abs(pole)
+        if not size:
+            return f"the {self.system}"
+        state = self._main_state(pole)
+        if group_of(state) in ("q_b", "r_b") and self.system == ROBOT:
+            return f"the rotation of the base at {size:.3g} rad/s"
+        text, details = f"the pole at {pole.real:.3g} 1/s of the {self.system}", list[str]()
+        if abs(pole.imag) > 1e-6 * size:
+            text = f"the mode at {size / (2.0 * math.pi):.3g} Hz of the {self.system}"
+            details.append(f"damping ratio {-pole.real / size:.2g}")
+        if state:
+            details.append(f"mainly {state}")
+        return f"{text} ({', '.join(details)})" if details else text
+
+    def _main_state(self, pole: complex) -> str:
+        """Return the name of the state with the largest participation in the mode of a pole."""
+        if self.A is None:
+            return ""
+        poles, right = np.linalg.eig(self.A)
+        k = int(np.abs(poles - pole).argmin())
+        poles, left = np.linalg.eig(self.A.T)
+        participation = np.abs(left[:, int(np.abs(poles - pole).argmin())] * right[:, k])
+        index = int(participation[: len(self.state_names)].argmax())
+        return self.state_names[index]
+
+
+def rotation(rate: float) -> Poles:
+    """Return the pole of a rotation at `rate` [rad/s], which acts like an undamped oscillation."""
+    return Poles("rotation of the base or of a joint", np.array([1j * rate]))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledLoop:
+    """Sampled linear loop: its poles with the exact plant, and with the plant as it is integrated.
+
+    `lin` is the sampled model, and `generator` the continuous-time model from which it was
+    sampled. `loop` returns the matrix of the closed loop about a sampled model.
+    """
+
+    lin: LinearModel
+    generator: LinearModel
+    loop: Callable[[LinearModel], Array]
+
+    def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
+        """Return the largest step error; see `Limit`. The amplitudes are compared per sample."""
+        dt = self.lin.dt
+        if method is not CommutatorFree4:
+            return Demand(0.0, str)
+        steps = max(1, math.ceil(dt / h - 1e-9))
+        exact, simulated = _matched(
+            np.linalg.eigvals(self.loop(self.lin)),
+            np.linalg.eigvals(self.loop(self._integrated(dt / steps, steps))),
+        )
+        lasts = np.abs(exact) > _VANISHING
+        if not lasts.any():
+            return Demand(0.0, str)
+        exact = np.log(exact[lasts].astype(complex))
+        simulated = np.log(np.maximum(np.abs(simulated[lasts]), 1e-300))
+        errors = step_error(exact.real, simulated, dt, duration)
+        worst = int(errors.argmax())
+        return Demand(float(errors[worst]), lambda: Poles("sampled loop", exact / dt).mode(worst))
+
+    def _integrated(self, h: float, steps: int) -> LinearModel:
+        """Return the sampled model of the plant as the integrator computes it."""
+        A, B = self.generator.A, self.generator.B
+        nx = len(A)
+        step = np.eye(nx + B.shape[1])
+        step[:nx] = np.hstack(integrated_hold(A, B, h))
+        sample = np.linalg.matrix_power(step, steps)[:nx]
+        return replace(self.lin, A=sample[:, :nx], B=sample[:, nx:])
+
+
+def _matched(one: Values, other: Values) -> tuple[Values, Values]:
+    """Return two sets of poles (n,), ordered such that each pole is near its counterpart."""
+    from scipy.optimize import linear_sum_assignment
+
+    return one, other[linear_sum_assignment(np.abs(one[:, None] - other))[1]]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Function of time, such as a disturbance, with the longest step [s] that resolves it.
+
+    `step` is 0 if no step resolves the function, because it jumps within steps or is random.
+    """
+
+    name: str
+    step: float
+
+    @classmethod
+    def of(
+        cls, name: str, signal: Callable[[float], Array], dt: float | None, duration: float
+    ) -> Signal:
+        """Return the limit of a function of time, for a given step dt [s] or the default step."""
+        h = LONGEST_STEP if dt is None else dt
+        if np.array_equal(signal(0.0), signal(0.0)):
+            for halving in range(_HALVINGS + 1):
+                step = h / 2.0**halving
+                if _is_resolved(signal, step, duration):
+                    return cls(name, step)
+        return cls(name, 0.0)
+
+    def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
+        """Return the ratio of the step to the longest step that resolves the function."""
+        return Demand(h / self.step if self.step else 0.0, lambda: self.name)
+
+
+class Pace:
+    """The limits of the time step for a run of a given duration with a given method."""
+
+    def __init__(self, limits: Sequence[Limit], method: type[Integrator], duration: float) -> None:
+        self.limits = tuple(limits)
+        self._method = method
+        self._duration = duration
+
+    def demand(self, h: float) -> Demand:
+        """Return the largest step error (11.6) of a step of h [s]; it should be at most 1."""
+        demands = [each.demand(self._method, h, self._duration) for each in self.limits]
+        return max(demands, key=lambda each: each.error, default=Demand(0.0, str))
+
+    def step(self, longest: float = LONGEST_STEP) -> tuple[float, str]:
+        """Return the longest accurate step [s] of 1, 2 or 5 units, and the mode that limits it.
+
+        The unit is a power of ten of a second. If `longest` is accurate, return `longest` and an
+        empty text.
+        """
+        h, mode = longest, ""
+        while h > _SHORTEST_STEP and (demand := self.demand(h)).error > 1.0:
+            mode = demand.mode()
+            h = shorter(h)
+        return h, mode
+
+    @property
+    def fastest(self) -> Poles | None:
+        """The limit with the fastest pole, among the poles that are constant during the run."""
+        constant = [each for each in self.limits if isinstance(each, Poles) and each.state_names]
+        return max(constant, key=lambda each: each.fastest, default=None)
+
+    def remarks(self, h: float) -> Iterator[str]:
+        """Yield remarks on a step of h [s] that is too long."""
+        for each in self.limits:
+            if isinstance(each, Signal) and not each.step:
+                yield (
+                    f"{each.name} jumps within a step or is random, so no step resolves it; let "
+                    "it jump only at multiples of dt"
+                )
+        demand = self.demand(h)
+        if demand.error > 1.0 + 1e-9:
+            accurate, _ = self.step(shorter(h))
+            yield (
+                f"the step of {h:.3g} s is too long for {demand.mode()}, so the motion is not "
+                f"accurate; dt={accurate:g} (--dt {accurate:g}) is accurate"
+            )
+
+
+def shorter(h: float) -> float:
+    """Return the next shorter step [s] in the series 10, 5, 2, 1, 0.5, ... ms."""
+    unit = 10.0 ** math.floor(math.log10(h * (1.0 + 1e-9)))
+    for digit in (5.0, 2.0, 1.0):
+        if digit * unit < h * (1.0 - 1e-9):
+            return digit * unit
+    return 0.5 * unit
+
+
+def limits_of_step(
+    plant: Plant, policy: object, q: Array, v: Array, u: Array, sample: float
+) -> list[Limit]:
+    """Return the limits of the step for a run from q and v with the inputs u.
+
+    `sample` is the sample time [s] of the policy, or 0 if the policy is continuous.
+    """
+    A, B, names = _plant_model(plant, q, v, u)
+    limits: list[Limit] = [Poles.of(ROBOT, A, names)]
+    turning = plant.turning
+    if rate := float(np.abs(v[turning]).max(initial=0.0)):
+        limits.append(rotation(rate))
+    if policy is None:
+        return limits
+    tracking = tracking_of(policy)
+    if tracking is not None:
+        poles = np.zeros(0) if sample else poles_along(tracking.schedule)
+        limits.append(Poles("loop along the trajectory", poles))
+        reference = tracking.trajectory.v[:, turning]
+        limits.append(rotation(float(np.abs(reference).max(initial=0.0))))
+        return limits
+    linear = closed_loop(policy)
+    if sample:
+        loop = _sampled_loop(policy, sample)
+        return limits if loop is None else [*limits, loop]
+    if linear is not None:
+        loop_names = _loop_names(policy, len(linear[0]))
+        limits.append(Poles.of("closed loop", linear[0], loop_names))
+        return limits
+    commands = bound(policy, plant.robot)
+    if not hasattr(commands, "advance"):
+        unlimited = np.full(len(plant.actuation.names), np.inf)
+        law = Law(commands, plant.actuation.names, (-unlimited, unlimited), np.inf)
+        K = _derivatives(plant, law, q, v)
+        if K is not None:
+            limits.append(Poles.of("closed loop at the start", A + B @ K, names))
+    return limits
+
+
+def _plant_model(
+    plant: Plant, q: Array, v: Array, u: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return A, B and the state names of the robot, about its motion through q and v.
+
+    B is for inputs in base axes, except in orbit.
+    """
+    robot = plant.robot.replace(outputs=[FullState()])
+    frame = plant.state.frame if robot.orbit else "local"
+    model = Linearizer(robot, frame=frame, moving=robot.orbit is None)(q, v, u)
+    return model.A, model.B, model.state_names
+
+
+def _loop_names(policy: object, count: int) -> tuple[str, ...]:
+    """Return the names of the states of a closed loop with `count` states."""
+    lin, _ = feedback_of(policy)
+    names = () if lin is None else lin.state_names
+    return (*names, *(f"controller state {k}" for k in range(count - len(names))))
+
+
+def _sampled_loop(policy: object, sample: float) -> SampledLoop | None:
+    """Return the sampled loop of a linear policy, or None if its plant is not known."""
+    lin, K = feedback_of(policy)
+    if lin is None:
+        return None
+    sampled = lin if lin.dt else lin.discretize(sample)
+    generator = sampled.generator
+    if generator is None or not np.isclose(sampled.dt, sample):
+        return None
+    decides = decider(policy)
+    if isinstance(decides, LinearController):
+        return SampledLoop(sampled, generator, decides.loop_around)
+    if K is None:
+        return None
+    return SampledLoop(sampled, generator, lambda model: model.A - model.B @ K)
+
+
+def _derivatives(plant: Plant, law: Law, q: Array, v: Array) -> Array | None:
+    """Return the derivatives (nu, nx) of a policy's command at t = 0, or None if it has none.
+
+    The derivatives are with respect to the errors about a moving reference (5.1), and the command
+    is in base axes (in orbit, in the axes of the frame).
+    """
+    state, model = plant.state, plant.robot.model
+    nv = state.nx // 2
+
+    def command(displacement: Array) -> Array:
+        along = displacement[:nv].copy()
+        along[:3] *= 2.0  # q_b is half of a small rotation
+        at = pin.integrate(model, q, state.spread(along))
+        u = law(0.0, at, v + state.spread(displacement[nv:]))
+        if not plant.robot.orbit:
+            R = state.rotation(at)
+            for held in plant.actuation.held:
+                u[held] = u[held].dot(R)
+        return u
+
+    start = command(np.zeros(state.nx))
+    estimates = []
+    for size in _DISPLACEMENTS:
+        columns = [(command(unit) - start) / size for unit in size * np.eye(state.nx)]
+        estimates.append(np.array(columns).T)
+    one, other = estimates
+    if not np.abs(one - other).max() <= _SMOOTH * np.abs(other).max():
+        return None
+    return other
+
+
+def _is_resolved(signal: Callable[[float], Array], h: float, duration: float) -> bool:
+    """Return whether steps of h [s] resolve a function of time; see `_PARABOLA`."""
+    steps = max(1, math.floor(duration / h + 1e-9))
+    # The first step counts, and other steps that are spread over the run. The golden ratio keeps
+    # their times from being multiples of a period of the function.
+    spread = [math.floor(steps * math.fmod(k * 0.618034, 1.0)) for k in range(_WINDOWS)]
+    errors, largest = 0.0, 0.0
+    for first in sorted(set(spread)):
+        start = signal(first * h * ROUNDED_UP)
+        middle = signal((first + 0.5) * h)
+        end = signal((first + 1) * h * ROUNDED_DOWN)
+        for s in _BETWEEN:
+            exact = signal((first + s) * h)
+            weights = (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)
+            parabola = weights[0] * start + weights[1] * middle + weights[2] * end
+            errors = max(errors, float(np.abs(exact - parabola).max(initial=0.0)))
+            largest = max(largest, float(np.abs(exact).max(initial=0.0)))
+    return errors <= _PARABOLA * largest
