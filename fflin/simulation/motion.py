@@ -109,6 +109,8 @@ class Motion(StatesAndInputs, Design):
         States and inputs that have limits.
     engine : str
         Engine that ran the simulation, "compiled" or "python"; empty if the engine is not known.
+    step : float
+        Time step [s] of the simulation; 0 if it is not known.
     limits : ndarray (k, 2)
         Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
         infinite. Limits that the simulation does not enforce are included.
@@ -150,6 +152,7 @@ class Motion(StatesAndInputs, Design):
     limit_names: tuple[str, ...] = field(default_factory=tuple)
     limits: Open = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
+    step: float = 0.0
     phases: tuple[str, ...] = field(default_factory=tuple)
     starts: Vector = field(default_factory=lambda: np.zeros(0))
     _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved

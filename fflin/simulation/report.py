@@ -271,7 +271,8 @@ def motion_report(motion: Motion) -> str:
     kinds, t = error_sizes(motion), motion.t
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
-    head.append(f"{motion.robot}: {t[-1]:g} s, {len(t)} rows, frame {motion.frame}{by}")
+    steps = f" in steps of {motion.step:.3g} s" if motion.step else ""
+    head.append(f"{motion.robot}: {t[-1]:g} s{steps}, {len(t)} rows, frame {motion.frame}{by}")
     parts = [folded([*head, *([str(motion.orbit)] if motion.orbit else []), *motion.notes])]
     if kinds:
         rows = [["error", "unit", "initial", "largest", "final"]]
@@ -313,7 +314,7 @@ def motion_report(motion: Motion) -> str:
 
 def motion_record(motion: Motion) -> dict[str, object]:
     """Return the values of the report as {name: value}, for --json."""
-    t, own = motion.t, ["stopped", "frame", "engine", "saturated", "notes"]
+    t, own = motion.t, ["stopped", "frame", "engine", "step", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     errors = error_sizes(motion)
     # The errors of revolute and of prismatic joints have the same title but different units. For a

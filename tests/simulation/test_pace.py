@@ -141,7 +141,19 @@ def test_the_rates_of_a_fast_spin_are_accurate():
     motion = fflin.simulate(robot, v0=v0, duration=3.0)
     fine = fflin.simulate(robot, v0=v0, duration=3.0, dt=0.001)
     assert np.abs(motion.v[-1] - fine.v[-1]).max() / 60.0 < 0.01
-    assert "rotation" in motion.notes[0]
+    assert "rotation" in motion.notes[0] and len(motion.notes) == 1
+    assert "in steps of 0.005 s" in str(motion)
+
+
+def test_energy_shows_that_a_given_step_is_too_long():
+    robot = fflin.load("cubesat")
+    v0 = np.zeros(6)
+    v0[3:] = 60.0 * np.array([0.05, 1.0, 0.08])
+    motion = fflin.simulate(robot, v0=v0, duration=3.0, dt=0.012)
+    assert motion.momentum_drift.max() < 1e-13
+    change = np.abs(motion.energy / motion.energy[0] - 1.0).max()
+    assert 1e-5 < change < 1e-3
+    assert f"the energy changes by {100.0 * change:.2g} %" in motion.notes[-1]
 
 
 def test_a_function_gets_the_step_of_the_same_linear_policy():
