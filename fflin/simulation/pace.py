@@ -24,7 +24,7 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
 from fflin.control.linear_controller import LinearController, closed_loop
-from fflin.control.policies import bound, decider, feedback_of
+from fflin.control.policies import Policy, decider, feedback_of
 from fflin.control.tracking import poles_along, tracking_of
 from fflin.dynamics.integrators import CommutatorFree4, Integrator, integrated_hold
 from fflin.linear.linearization import Linearizer
@@ -284,18 +284,24 @@ def shorter(h: float) -> float:
 
 
 def limits_of_step(
-    plant: Plant, policy: object, q: Array, v: Array, u: Array, sample: float
+    plant: Plant,
+    policy: object,
+    commands: Policy | None,
+    q: Array,
+    v: Array,
+    u: Array,
+    sample: float,
 ) -> list[Limit]:
     """Return the limits of the step for a run from q and v with the inputs u.
 
-    `sample` is the sample time [s] of the policy, or 0 if the policy is continuous.
+    `commands` is the policy, bound to the robot, or None without a policy. `sample` is the sample time [s] of the policy, or 0 if the policy is continuous.
     """
     A, B, names = _plant_model(plant, q, v, u)
     limits: list[Limit] = [Poles.of(ROBOT, A, names)]
     turning = plant.turning
     if rate := float(np.abs(v[turning]).max(initial=0.0)):
         limits.append(rotation(rate))
-    if policy is None:
+    if commands is None:
         return limits
     tracking = tracking_of(policy)
     if tracking is not None:
@@ -312,7 +318,6 @@ def limits_of_step(
         loop_names = _loop_names(policy, len(linear[0]))
         limits.append(Poles.of("closed loop", linear[0], loop_names))
         return limits
-    commands = bound(policy, plant.robot)
     if not hasattr(commands, "advance"):
         unlimited = np.full(len(plant.actuation.names), np.inf)
         law = Law(commands, plant.actuation.names, (-unlimited, unlimited), np.inf)

@@ -122,9 +122,10 @@ class Plan:
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
+        commands = None if policy is None else bound(policy, robot)
         sample = sample_of(policy, options.sample)
         u = _inputs_at_start(policy, plant)
-        limits = limits_of_step(plant, policy, self.q, self.v, u, sample or 0.0)
+        limits = limits_of_step(plant, policy, commands, self.q, self.v, u, sample or 0.0)
         if options.disturbance is not None:
             disturbance = partial(plant.disturbing, q=self.q, v=self.v)
             limits.append(Signal.of("the disturbance", disturbance, options.dt, duration))
