@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import unknown
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
 
@@ -69,7 +69,7 @@ class Integrator(ABC):
 
     @classmethod
     @abstractmethod
-    def growth(cls, z: Array) -> Array:
+    def growth(cls, z: Values) -> Array:
         """Return ln|R(z)| for poles times the step, z = lambda h.
 
         A step multiplies the amplitude of the mode with the pole lambda by |R(z)|. The exact factor
@@ -118,7 +118,7 @@ class CommutatorFree4(Integrator):
     )
 
     @classmethod
-    def growth(cls, z: Array) -> Array:
+    def growth(cls, z: Values) -> Array:
         """Return ln|R(z)| with the Taylor polynomial R of order 4; see `Integrator.growth`."""
         R = 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
         with np.errstate(divide="ignore"):
@@ -135,7 +135,7 @@ class SemiImplicitEuler(Integrator):
     displacements, speeds = ((1.0, 1.0), (0.0, 0.0)), ((1.0, 1.0),)
 
     @classmethod
-    def growth(cls, z: Array) -> Array:
+    def growth(cls, z: Values) -> Array:
         """Return ln|R(z)|; see `Integrator.growth`.
 
         For a complex pole, R is the larger eigenvalue of the step of the oscillator with the

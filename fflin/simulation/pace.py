@@ -175,11 +175,11 @@ class SampledLoop:
         lasts = np.abs(exact) > _VANISHING
         if not lasts.any():
             return Demand(0.0, str)
-        exact = np.log(exact[lasts].astype(complex))
-        simulated = np.log(np.maximum(np.abs(simulated[lasts]), 1e-300))
-        errors = step_error(exact.real, simulated, dt, duration)
+        poles = np.log(exact[lasts].astype(complex)) / dt
+        growth: Array = np.log(np.maximum(np.abs(simulated[lasts]), 1e-300))
+        errors = step_error(poles.real * dt, growth, dt, duration)
         worst = int(errors.argmax())
-        return Demand(float(errors[worst]), lambda: Poles("sampled loop", exact / dt).mode(worst))
+        return Demand(float(errors[worst]), lambda: Poles("sampled loop", poles).mode(worst))
 
     def _integrated(self, h: float, steps: int) -> LinearModel:
         """Return the sampled model of the plant as the integrator computes it."""
@@ -294,7 +294,8 @@ def limits_of_step(
 ) -> list[Limit]:
     """Return the limits of the step for a run from q and v with the inputs u.
 
-    `commands` is the policy, bound to the robot, or None without a policy. `sample` is the sample time [s] of the policy, or 0 if the policy is continuous.
+    `commands` is the policy, bound to the robot, or None without a policy. `sample` is the sample
+    time [s] of the policy, or 0 if the policy is continuous.
     """
     A, B, names = _plant_model(plant, q, v, u)
     limits: list[Limit] = [Poles.of(ROBOT, A, names)]

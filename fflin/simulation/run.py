@@ -329,6 +329,18 @@ class Recording(NamedTuple):
     engine: str  # name of the engine
 
 
+def _follower(plan: Plan) -> Callable[[int], None] | None:
+    """Return a function that integrates the state of the policy, or None if it has no state.
+
+    The argument is the number of stages of the present step that are computed.
+    """
+    advance = getattr(plan.law.policy, "advance", None) if plan.law else None
+    if advance is None:
+        return None
+    weights = plan.method.step_weights(plan.times.dt)[1]
+    return lambda stages: advance(weights[stages - 1, : stages + 1], stages == len(weights))
+
+
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
@@ -338,9 +350,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage = plan.method(plant.robot.model, dt).step, plant.stage
-    # Function that integrates the state of the policy, or None if the policy has no state.
-    follow = getattr(law.policy, "advance", None) if law else None
-    weights = plan.method.step_weights(dt)[1]
+    follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     ends = np.cumsum([len(q), len(v), len(plan.initial), 6])
     rows, at, t, stages = np.empty((times.rows, ends[-1] + 3)), list[float](), 0.0, 0
@@ -360,7 +370,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
             kept.wrenches[stages][:] = kept.wrench(q, push)
         stages += 1
         if follow:
-            follow(weights[stages - 1, : stages + 1], stages == len(weights))
+            follow(stages)
         return a
 
     ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.options.progress)
@@ -389,13 +399,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
         record()
-    return Recording(
-        np.array(at),
-        *np.split(rows[: len(at)], ends, axis=1),
-        steps=step + 1,
-        stopped=stopped,
-        engine="python",
-    )
+    q_of, v_of, u_of, momentum, center = np.split(rows[: len(at)], ends, axis=1)
+    return Recording(np.array(at), q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
 
 
 def stop_conditions(plan: Plan) -> StopConditions:

@@ -44,6 +44,8 @@ _FRACTION, _COMPILING = 0.1, 30.0
 # oscillation by less than 1e-7 of its frequency.
 _PART = 0.1
 
+_SMALL = 1e-6  # deviation from the target at which limits do not act, to find the poles of a loop
+
 # Changes of the energy of a free motion, relative to its largest kinetic energy, above which a note
 # says that the step is too long. With springs, a step may change the amplitudes by 1 %, and so the
 # energy by 2 %. Without springs, the energy hardly changes even if the rates are wrong: a spinning
@@ -385,11 +387,14 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     cuts = not sample and plan.limits.cuts
     # Without limits, a step of a continuous loop is e -> A e + f0 with constant A and f0, and its
     # command is included in A. With limits, the loop is integrated in short parts of a step.
-    A, B, f0 = lin.A, lin.B, lin.f0[:, None]
+    A: Array = lin.A
+    B: Array = lin.B
+    f0: Array = lin.f0[:, None]
+    parts = 1
     if not sample:
         f0 = rate(np.zeros(len(e)))[:, None]
-        A = np.column_stack([rate(unit) - f0[:, 0] for unit in np.eye(len(e))])
-    parts = 1
+        size = _SMALL if cuts else 1.0
+        A = np.column_stack([(rate(size * unit) - f0[:, 0]) / size for unit in np.eye(len(e))])
     if cuts:
         fastest = max(np.abs(np.linalg.eigvals(each)).max(initial=0.0) for each in (A, lin.A))
         parts = math.ceil(max(1.0, fastest * dt / _PART))
@@ -410,7 +415,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
 
 def _runge_kutta(rate: Callable[[Array], Array], e: Array, h: float) -> Array:
     """Return e after a step of h [s] of the classical Runge-Kutta method, for de/dt = rate(e)."""
-    after, slope = e, np.zeros(len(e))
+    after: Array = e
+    slope: Array = np.zeros(len(e))
     for fraction, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
         slope = rate(e + fraction * h * slope)
         after = after + weight * h / 6.0 * slope
