@@ -15,7 +15,7 @@ from fflin.base.validation import Array, Vector, instance, vector
 from fflin.batch.files import is_constant
 from fflin.batch.linear_batch import LinearBatch
 from fflin.control.gain import Gain
-from fflin.control.lqr import lqr
+from fflin.control.lqr import regulator
 from fflin.control.optimal.riccati import Solution, half_size
 from fflin.control.policies import Feedback, Policy
 from fflin.control.weights import weight
@@ -178,7 +178,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         found: Solution | Gain | None = half_size(batch.A[0], B, Q, R) if direct else None
         if found is None:
             with located(f"point {index}"):
-                found = lqr(batch[index], Q, R)
+                found = regulator(batch[index], Q, R)
         K[index], residual[index], margin[index] = found.K, found.residual, found.margin
     return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 

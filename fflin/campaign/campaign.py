@@ -120,8 +120,8 @@ class Campaign(FrozenArrays):
         Errors of each kind, and commanded inputs, at the `times`. After a run is stopped, its
         errors are infinite and its commands are zero.
     stop, end : ndarray (N,)
-        Outcome (0 completed, 1 diverged, 2 left the chart, 3 stopped for another reason) and end
-        time [s] of each run.
+        Outcome (0 completed, 1 diverged, 3 stopped for another reason) and end time [s] of each
+        run. The outcome 2 does not occur, because runs continue beyond 180 deg.
     asked : int
         Requested number of runs. N is smaller if the condition `until` ended the campaign early.
     goals : tuple of str

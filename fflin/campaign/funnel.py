@@ -74,8 +74,8 @@ class Funnel(Design):
         spaced.
     outcomes : ndarray (m, N)
         Outcome of each run, in ascending order of the level of the initial error: 0 if the goal was
-        reached, 1 if the run was stopped early, 2 if the bounds `within` were exceeded, 3 if the
-        goal was missed.
+        reached, 1 if the run was stopped early or its attitude error exceeded 176 deg, 2 if the
+        bounds `within` were exceeded, 3 if the goal was missed.
     rho : ndarray (m,)
         Level up to which every run reached the goal; the size of the ellipsoid at the knot.
     inside : ndarray (m,)

@@ -48,7 +48,8 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
-# Attitude error [deg] above which a run counts as having left the chart. The chart ends at 180 deg.
+# Attitude error [deg] above which a run of `validity` or `funnel` counts as having left the chart.
+# The chart ends at 180 deg.
 EDGE = 176.0
 # LOOK is the number of steps between checks of the condition `CampaignJob.over`. If this condition
 # is None, one call of the compiled loop computes up to _LONG steps.
@@ -129,11 +130,13 @@ class CampaignJob:
         settings: dict[str, Any] = dict(options)
         histories = settings.pop("histories", 0)
         unlimited = settings.pop("unlimited", False)
+        within_chart = settings.pop("within_chart", False)
         settings |= {"robot": robot, "policy": policy, "linear": False, "progress": False}
         self.plan = Plan(SimulationOptions(**settings))
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
             self.plan = self.plan.replace(limits=Saturation(-most, most))
+        self.plan = self.plan.replace(within_chart=within_chart)
         self.judge, self.over = judge, over
         self.plant, times = self.plan.plant, self.plan.times
         self.kinds = kinds_of(self.plant.state)

@@ -171,6 +171,8 @@ class Loop:
         options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
         # Without `limits`, inputs do not saturate, and thrusts can be negative.
         options |= {"limits": limits, "unlimited": limits is None, "project": not predicts}
+        # The linear loop predicts rotations of less than 180 deg only.
+        options |= {"within_chart": True}
         options |= {"histories": checks + 1 if predicts else 1}
         judge = partial(self._judged, self._transition(dt, every) if predicts else None)
         over, policy = None if predicts else self._is_over, StateFeedback(lin, self.K)

@@ -37,7 +37,9 @@ class Validity(FrozenArrays):
 
     The closed loop is simulated from initial displacements of several levels. The level of a
     displacement is its size as a fraction of the largest displacement that was tested. Base
-    attitude, base position and joints are displaced at the same time, in a random direction.
+    attitude, base position and joints are displaced at the same time, in a random direction. A run
+    ends if the base rotates past 180 deg, because the linear model does not predict this. In
+    simulations and campaigns, the law continues there.
 
     Attributes
     ----------

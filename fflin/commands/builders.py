@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
-from fflin.base.errors import FflinWarning, InputError, UnknownNameError, located
+from fflin.base.errors import InputError, UnknownNameError, located
 from fflin.base.names import joints_by_name, rates_by_name
 from fflin.commands import DONE
 
@@ -127,11 +126,9 @@ def state_of(
     """Combine `states` with the options of a command; return q (nq,), and v (nv,) or None.
 
     Later states override earlier states, and options override all states. The options are --joint,
-    --rpy, --position and --velocity. Their names can have a prefix, such as ``target_``. A joint
-    outside its limits causes a warning.
+    --rpy, --position and --velocity. Their names can have a prefix, such as ``target_``.
     """
     from fflin.dynamics.points import base_of, combined
-    from fflin.robot.fields import travel_of
 
     given = {
         name: value
@@ -146,12 +143,6 @@ def state_of(
     given["velocity"] = rates_by_name(names, rates)
     state = reduce(combined, (*states, given))
     q = fflin.configuration(robot, state["joints"], base_of(state))
-    for joint in robot.joints:
-        low, high = travel_of(robot.model, joint)
-        value, unit = state["joints"].get(joint.name), joint.unit
-        if value is not None and not low <= value <= high:
-            text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
-            warnings.warn(text, FflinWarning, stacklevel=2)
     return q, fflin.velocity(robot, state["velocity"]) if state["velocity"] else None
 
 
@@ -274,25 +265,21 @@ def weights_of(arguments: Namespace) -> dict[str, object]:
 
 
 def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
-    """Return the regulator of a model, and warn of small margins or negative thrust.
+    """Return the regulator of a model.
 
     The options --weights, --q, --r and --bryson define the weights. With --sample, the model is
     first discretised. If `allocated` is true, the error for an unknown name mentions --no-allocate.
     """
-    from fflin.control.gain import cautions
     from fflin.control.lqr import require_fixed_point
 
     require_fixed_point(lin)
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
     try:
-        gain = fflin.lqr(lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds)
+        return fflin.lqr(lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds)
     except UnknownNameError as error:
         hint = "; --no-allocate weights single thrusters" * allocated
         raise UnknownNameError(f"{error}{hint}") from None
-    for text in cautions(gain):
-        warnings.warn(text, FflinWarning, stacklevel=2)
-    return gain
 
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:

@@ -16,7 +16,7 @@ from fflin.base.errors import (
 )
 from fflin.base.validation import Array, ArrayLike, dimension, instance
 from fflin.control.default_weights import Pace
-from fflin.control.gain import Gain, make_gain
+from fflin.control.gain import Gain, cautions, make_gain
 from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
 from fflin.dynamics.state import selection
@@ -114,7 +114,11 @@ def lqr(
     Warns
     -----
     FflinWarning
-        If the weights are so badly scaled that the relative residual exceeds 1e-8.
+        If one of these conditions is true:
+
+        - the weights are so badly scaled that the relative residual exceeds 1e-8;
+        - the phase margin at the inputs is small;
+        - the gain commands negative thrust.
 
     References
     ----------
@@ -128,6 +132,30 @@ def lqr(
     ((9, 18), True)
     >>> fflin.lqr(lin, {"q_b": 100.0, "r_b": 10.0, "q_m": 10.0}, 1.0).margin > 0
     True
+    """
+    gain = regulator(lin, Q, R, N, weights=weights, wheel_speeds=wheel_speeds)
+    _caution(gain)
+    return gain
+
+
+def _caution(gain: Gain) -> None:
+    """Warn of a small disk margin at the inputs, and of negative thrust."""
+    for text in cautions(gain):
+        warnings.warn(text, FflinWarning, stacklevel=3)
+
+
+def regulator(
+    lin: LinearModel,
+    Q: Weight | None = None,
+    R: Weight | None = None,
+    N: ArrayLike | None = None,
+    *,
+    weights: Rule | None = None,
+    wheel_speeds: bool | None = None,
+) -> Gain:
+    """Return the same gain as `lqr`, without the warnings about margins and thrusters.
+
+    Other designs contain such a gain as a part, for example as their terminal cost.
     """
     require_fixed_point(lin)
     rule = "as given"
@@ -187,6 +215,11 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
     ModelError
         If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
+    Warns
+    -----
+    FflinWarning
+        If the phase margin at the inputs is small, or the gain commands negative thrust.
+
     References
     ----------
     Y. Yang, Analytic LQR design for spacecraft control system based on quaternion model, J.
@@ -245,7 +278,9 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
         )
     R = L.T @ (ra[:, None] * L)
     found = solved(P, K, poles, residual, "closed form")
-    return make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, np.zeros_like(lin.B))
+    gain = make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, np.zeros_like(lin.B))
+    _caution(gain)
+    return gain
 
 
 def _diagonal(
@@ -317,6 +352,6 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array) -> Solution:
             f"the relative residual of the Riccati equation is {solution.residual:.0e}, so the "
             "gain is inaccurate: the weights are badly scaled; scale them, for example with bryson",
             FflinWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return solution

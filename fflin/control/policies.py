@@ -195,7 +195,7 @@ class AllocatedPolicy:
         All inputs are within their limits.
         """
         state = self._design.state
-        chart = state.chart(q)
+        chart = state.unchecked_chart(q)
         u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
         columns = chart.to_reference(self._robot.held, self._robot.columns(self._data, q).T).T
@@ -313,13 +313,14 @@ class Loop:
         def measured(u: Array) -> Array:
             a = self._at_rest
             if aba := self._aba:
-                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+                in_base = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
+                a = aba.acceleration(q, v, in_base)
             return np.asarray(measure(x, q, v, a) + noise)
 
         u, after = step(self.estimate, measured)
         if self.dt:
             self.estimate = after
-        else:
+        elif len(self.estimate):
             self.rates.append(after)
         return u
 
@@ -327,9 +328,10 @@ class Loop:
         """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages.
 
         `last` must be True at the last stage of a step. The state of a sampled compensator is not
-        changed.
+        changed. A compensator without states may be called at some of the stages only, because its
+        command may be held.
         """
-        if not self.dt:
+        if not self.dt and len(self.estimate):
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
                 self.rates, self.stages = [self.estimate], 0

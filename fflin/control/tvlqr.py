@@ -18,7 +18,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import Gain, ModelDesign
-from fflin.control.lqr import lqr
+from fflin.control.lqr import regulator
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, sampled_cost, weight
 from fflin.dynamics.integrators import held_cost
@@ -434,15 +434,15 @@ def steady_regulator(
     If the inputs cannot stabilise the model, its `momentum_reduction` is regulated.
     """
 
-    def regulator(lin: LinearModel, Q: Array) -> Gain:
+    def about(lin: LinearModel, Q: Array) -> Gain:
         if not sample:
-            return lqr(lin, Q, R)
-        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R))
+            return regulator(lin, Q, R)
+        return regulator(lin.discretize(sample), *sampled_cost(lin, sample, Q, R))
 
     try:
-        gain = regulator(lin, Q)
+        gain = about(lin, Q)
         return gain.P, gain.K
     except StabilizabilityError:
         part = momentum_reduction(lin)
-        gain = regulator(part, part.T.T @ Q @ part.T)
+        gain = about(part, part.T.T @ Q @ part.T)
         return part.S.T @ gain.P @ part.S, gain.K @ part.S

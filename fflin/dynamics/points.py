@@ -1,17 +1,20 @@
 """Configurations, velocities and inputs, built from values that are given by name."""
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, ArrayLike, instance, numbers, placement
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.robot.fields import travel_of
 from fflin.robot.inputs import named_wheels
-from fflin.robot.joints import ROOT, by_joint
+from fflin.robot.joints import ROOT, Joint, by_joint
 from fflin.robot.robot import Robot
 
 LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squared speeds and their sums do not overflow
@@ -42,6 +45,12 @@ def configuration(
     InputError
         If a value is not a finite number, or a named joint is a mimic joint.
 
+    Warns
+    -----
+    FflinWarning
+        If a value is outside the position limits of the joint, which fflin does not enforce. A
+        common reason is an angle in degrees.
+
     Examples
     --------
     >>> robot = fflin.load("planar_detumble")
@@ -58,9 +67,25 @@ def configuration(
     if joints is not None:
         values = numbers("joints", joints, "joint", "joint")
         for name, value in by_joint(values, robot.joint_names, robot.joint).items():
-            robot.joint(name).place(q, value)
+            joint = robot.joint(name)
+            joint.place(q, value)
+            _warn_beyond_travel(robot, joint, value)
     robot.follow(q)
     return robot.checked_configuration(q)
+
+
+def _warn_beyond_travel(robot: Robot, joint: Joint, value: float) -> None:
+    """Warn if the value of a joint [rad|m] is outside the position limits of the joint."""
+    low, high = travel_of(robot.model, joint)
+    if low <= value <= high:
+        return
+    unit = joint.unit
+    text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
+    radians = math.radians(value)
+    # A larger angle is more than a full turn, so it was probably meant in degrees.
+    if unit == "rad" and abs(value) > 2.0 * math.pi and low <= radians <= high:
+        text += f"; angles are in rad, and {value:g} deg are {radians:.4g} rad"
+    warnings.warn(text, FflinWarning, stacklevel=3)
 
 
 def require_slow(what: str, v: Array) -> None:

@@ -171,13 +171,21 @@ class StateMap:
         ChartError
             If the base is rotated by 180 deg from the reference.
         """
-        chart = Chart.of(turning.quaternion_product(self.origin_quaternion, q[3:7]))
+        chart = self.unchecked_chart(q)
         if chart.q0 < SMALLEST_Q0:
             raise ChartError(
                 "the base is rotated by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
             )
         return chart
+
+    def unchecked_chart(self, q: Array) -> Chart:
+        """Return the attitude chart at a valid q (nq,), without the check against 180 deg.
+
+        At 180 deg, the matrix J does not exist, but q_b and R do. The sign of the quaternion in q
+        then selects one of the two values of q_b.
+        """
+        return Chart.of(turning.quaternion_product(self.origin_quaternion, q[3:7]))
 
     def charts(self, q: Array) -> Chart:
         """Return the attitude charts at valid q (.., nq), without the check against 180 deg."""
@@ -236,12 +244,17 @@ class StateMap:
         v = self.robot.checked_velocity(v)
         if near is not None:
             near = vector("near", near, self.nx, "a state (12 + 2n)")
+        self.chart(q)  # raises an error at 180 deg
         return self.read(q, v, near=near)
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Return the same state as `to_state`, without checking the arguments."""
+        """Return the same state as `to_state`, without checking the arguments.
+
+        Control laws read the state at every attitude. Therefore 180 deg is allowed here, see
+        `unchecked_chart`.
+        """
         q_m, nu = self.joint_positions(q), self.velocities(v)
-        x = self.compose(self.chart(q), self.positions(q), q_m, nu)
+        x = self.compose(self.unchecked_chart(q), self.positions(q), q_m, nu)
         return x if near is None else names.unwound(self, x, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:

@@ -22,7 +22,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
-from fflin.base.validation import Array
+from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, write_atomically
 from fflin.control.policies import Loop, Measure, Policy
 from fflin.dynamics.coordinates import frame_of
@@ -186,6 +186,9 @@ class CLaw:
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
         Placement relative to which the state and the inputs on the base are measured.
+    initial_inputs : ndarray (nu,)
+        Inputs at the target or, for a trajectory, at its first sample. If commands are delayed,
+        these inputs act until the first command arrives.
 
     Raises
     ------
@@ -225,6 +228,7 @@ class CLaw:
         self._about = _description(source / f"{self.name}.json")
         self.dt: float = self._about["dt"]
         self.frame: str = self._about["frame"]
+        self.initial_inputs: Array = frozen(np.array(self._about["u0"], dtype=float))
         placement = self._about["reference"]
         self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
         if self._about["kind"] == "output" and placement is None:

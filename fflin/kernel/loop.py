@@ -193,8 +193,7 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
     - `squares`: squared limits of the entries of nu (6 + n,). In the Python engine, `squares`
       contains the squared limits of the entries of v (nv,).
     - `sign` (1,): the sign that q0 must keep, where q0 is the scalar part of the quaternion from
-      the reference to the base. If the policy uses no chart, the sign is 0, and every attitude is
-      allowed.
+      the reference to the base. If the sign is 0, every attitude is allowed.
     """
 
 
@@ -242,10 +241,9 @@ def _combine(shares, row, rates, out):
 
 
 def goes_on(stop: StopConditions, origin: Entries, q: Entries, rates: Entries) -> bool:
-    """Return True if all velocities are below their limits and the base is within the chart.
+    """Return True if all velocities are below their limits and the attitude is allowed.
 
-    `rates` are the velocities. If `stop.sign` is 0, every attitude is allowed. In compiled code,
-    both conditions must be met in all lanes.
+    `rates` are the velocities. In compiled code, both conditions must be met in all lanes.
     """
     vector, scalar = vec.get3(origin, 3), load(origin, 6)
     scalar = scalar * load(q, 6) - vec.dot(vector, vec.get3(q, 3))

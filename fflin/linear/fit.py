@@ -158,7 +158,8 @@ def outputs(
     a: Array = np.zeros(robot.nv)
     if any(output.FEELS_ACCELERATION for output in robot.outputs):
         aba = Aba(state)
-        a = aba.acceleration(at, moving, aba.actuation.in_base_axes(state.chart(at), u))
+        in_base = aba.actuation.in_base_axes(state.unchecked_chart(at), u)
+        a = aba.acceleration(at, moving, in_base)
     x = state.read(at, moving, near=state.read(lin.q, lin.v))
     return Measuring(state, lin.q)(x, at, moving, a)
 

@@ -47,8 +47,9 @@ class Motion(StatesAndInputs, Design):
     v : ndarray (N, nv)
         Configuration and velocity in Pinocchio's order.
     x : ndarray (N, nx)
-        State in the chart defined by `reference` and `frame`. The angles of continuous joints are
-        not wrapped at a full turn.
+        State in the chart defined by `reference` and `frame`. The rotation q_b is at most 180 deg:
+        if the base rotates further, q_b jumps to the shorter rotation. The angles of continuous
+        joints are not wrapped at a full turn.
     u : ndarray (N, nu)
         Inputs just after each time t, in the axes of `frame`. The last row repeats the inputs of
         the row before it, because no inputs are applied after the last time.
@@ -57,7 +58,7 @@ class Motion(StatesAndInputs, Design):
         The array is empty if no target is known.
     prediction : ndarray (N, nx)
         States that the linear model predicts under the same control law. The array has no rows if
-        there is no prediction.
+        there is no prediction, for example because the base rotates past 180 deg.
     energy : ndarray (N,)
         Kinetic energy, plus the potential energy of gravity and springs [J]. In orbit, `energy`
         is the Jacobi integral: kinetic energy relative to the orbital frame, plus the potentials

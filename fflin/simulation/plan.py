@@ -147,6 +147,8 @@ class Plan:
         # q, v and u of the motion that the policy follows, or None.
         self.target = target_of(state, lin if options.target is None else options.target)
         self.reference = follows if options.target is None else None
+        # Motion that the policy follows, or None, whatever the target.
+        self.follows = follows
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
         # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
         # If `near` is None, this angle is within half a turn of 0.
@@ -163,6 +165,8 @@ class Plan:
         self.steered = fed_back(policy)  # states that the policy feeds back, if known
         # Function of time that returns the measurement noise; None if the policy defines no noise.
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
+        # Whether the run ends when the base leaves the attitude chart of the reference.
+        self.within_chart = False
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
 
@@ -213,7 +217,7 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
             f"{f' in frame {state.frame!r}' * bool(state.robot.orbit)}"
         )
     near = selection(target.state_names, state.names).T @ target.x0
-    return state.read(target.q, target.v, near=near)
+    return state.to_state(target.q, target.v, near=near)
 
 
 def _state_of(policy: object, options: SimulationOptions) -> StateMap:
@@ -264,7 +268,8 @@ def _inputs_at_start(policy: object, plant: Plant) -> Array:
         return lin.u0
     if along is not None and along is policy:
         return along.reference(0.0)[2]
-    return np.zeros(len(actuation.names))
+    of_code: Array | None = getattr(policy, "initial_inputs", None)  # C code contains no model
+    return np.zeros(len(actuation.names)) if of_code is None else of_code
 
 
 def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> None:
@@ -273,10 +278,13 @@ def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> Non
     If the policy follows a trajectory, warn if its inputs exceed the limits at any time.
     """
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
+    own = getattr(policy, "initial_inputs", None)  # of C code, which contains no model
     if lin is not None and lin.input_names == actuation.names:
         where, inputs = "at its target", lin.u0[None]
     elif along is not None and along is policy:
         where, inputs = "on its trajectory", along.trajectory.u_base
+    elif own is not None:
+        where, inputs = "at its target", own[None]
     else:
         return
     units = dict(zip(actuation.names, actuation.units, strict=True))

@@ -22,7 +22,6 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, ArrayLike, as_double, vector
-from fflin.control.policies import feedback_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
@@ -407,9 +406,11 @@ def stop_conditions(plan: Plan) -> StopConditions:
     """Return the stop conditions of a run; `squares` has the squared limits of the entries of v."""
     squares = np.full(len(plan.v), LARGEST_SPEED**2)
     squares[plan.plant.turning] = plan.times.slow
-    # If the policy has a linear model, the run ends when the base leaves the attitude chart.
-    charted = feedback_of(plan.policy)[0] is not None
-    sign = float(np.sign(plan.plant.state.scalar(plan.q))) if charted else 0.0
+    # A policy is defined at every attitude. So only a comparison with a linear model ends a run in
+    # which the base leaves the attitude chart.
+    sign = 0.0
+    if plan.within_chart:
+        sign = float(np.sign(plan.plant.state.scalar(plan.q)))
     return StopConditions(squares=squares, sign=[sign])
 
 

@@ -13,10 +13,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.names import group_of
 from fflin.base.process import LONG_RUN
+from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.linear_controller import LinearController, growing
-from fflin.control.policies import Policy, StateFeedback, feedback_of
+from fflin.control.policies import Policy, StateFeedback, axes_of, feedback_of
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame, state_history
 from fflin.dynamics.integrators import held_exponential
@@ -128,8 +130,8 @@ def simulate(
         evaluated at every stage of every integration step.
     delay : float
         Time [s] from a sample until its command takes effect, a multiple of dt. Until the first
-        command takes effect, the input is u0 of the policy's model, or zero without a model. If
-        `delay` is given without `sample`, the policy is sampled every dt.
+        command takes effect, the input is u0 of the policy's model or C code, or zero for a
+        function. If `delay` is given without `sample`, the policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
         Limits at which the inputs saturate. By default, inputs do not saturate. Limits are one of
 
@@ -152,7 +154,8 @@ def simulate(
         Model that predicts the motion under the same control law. The default is the policy's own
         model; with False, there is no prediction. The motion can be predicted without a policy,
         and for a StateFeedback, an OutputFeedback or a LinearController, but not for a
-        discrete-time model that was read from a file. The prediction ignores noise.
+        discrete-time model that was read from a file. The prediction ignores noise. If the base
+        rotates past 180 deg from the reference, the prediction is omitted.
     target : LinearModel or array_like (nx,), optional
         Target state from which errors are measured, or a model whose operating point is the
         target. The default is the operating point of the policy's own model, or the state of the
@@ -179,8 +182,9 @@ def simulate(
     -------
     Motion
         Simulated motion. If the motion ended early, ``stopped`` gives the reason: an event, an
-        interrupt (Ctrl-C), an attitude beyond the range of the chart, or a diverging simulation,
-        with its step size.
+        interrupt (Ctrl-C), or a diverging simulation, with its step size. The motion continues if
+        the base rotates past 180 deg: policies then use the shorter rotation, see
+        docs/guide/simulation.md.
 
     Raises
     ------
@@ -240,6 +244,12 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
+    beyond = past_half_turn(plan, run)
+    # Beyond 180 deg from the reference, q_b jumps to the shorter rotation. A linear model does not
+    # predict this jump.
+    prediction = x[:0]
+    if foresees is not None and beyond is None:
+        prediction = predict(plan, foresees, x, run.steps)
     if plan.reference is not None:
         q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
         target = state_history(state, q, v, plan.near, run.t)
@@ -258,7 +268,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         step=plan.times.dt,
         x=x,
         target=target,
-        prediction=x[:0] if foresees is None else predict(plan, foresees, x, run.steps),
+        prediction=prediction,
         energy=energy,
         momentum=np.roll(momentum, 3, axis=1),
         momentum_drift=drift.max(axis=1),
@@ -285,6 +295,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
             *plan.times.notes,
             *_gained(plan, run, energy, float(scale[0])),
             *getattr(bound, "notes", ()),
+            *half_turn_notes(plan, beyond, predicted=foresees is not None),
         ),
         limit_names=tuple(limits),
         limits=np.array(list(limits.values())).reshape(-1, 2),
@@ -308,6 +319,46 @@ def _gained(plan: Plan, run: Recording, energy: Array, scale: float) -> Iterator
             f"the energy changes by {100.0 * change:.2g} % of its largest kinetic part, although "
             "no force does work, so the motion is not accurate; give a smaller dt"
         )
+
+
+def past_half_turn(plan: Plan, run: Recording) -> float | None:
+    """Return the time [s] of the first recorded row after the base rotated past 180 deg, or None.
+
+    The rotation is relative to the reference of q_b. For a policy that follows a trajectory, the
+    rotation is relative to the attitude of the trajectory.
+    """
+    if plan.follows is None:
+        reference = conjugate(plan.plant.state.origin_quaternion)
+    else:
+        reference = np.array([plan.follows(t)[0][3:7] for t in run.t.tolist()])
+        # Of the two quaternions of each attitude, choose the one that is nearer to the row before.
+        products = (reference[1:] * reference[:-1]).sum(axis=1)
+        reference[1:] *= np.cumprod(np.where(products < 0.0, -1.0, 1.0))[:, None]
+    # The scalar part of the quaternion from the reference to the base changes its sign at 180 deg.
+    negative = (run.q[:, 3:7] * reference).sum(axis=1) < 0.0
+    rows = np.flatnonzero(negative != negative[0])
+    return float(run.t[rows[0]]) if len(rows) else None
+
+
+def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> list[str]:
+    """Return a note if the base rotated past 180 deg at the time `beyond` [s] and this matters.
+
+    It matters if the policy feeds the attitude back, or if the motion was to be predicted.
+    """
+    if beyond is None:
+        return []
+    clauses = list[str]()
+    known = plan.follows is not None or axes_of(plan.policy)[1] is not None
+    steered = not plan.steered or "q_b" in map(group_of, plan.steered)
+    if plan.policy is not None and known and steered:
+        clauses.append("the law continued with the shorter rotation")
+    if predicted:
+        clauses.append("the linear prediction is omitted, because it does not hold there")
+    if not clauses:
+        return []
+    what = "reference" if plan.follows is None else "trajectory"
+    at = f"the base rotated past 180 deg from the {what} at t = {beyond:g} s"
+    return [f"{at}; {'; '.join(clauses)}"]
 
 
 def predictor(plan: Plan) -> Predictor | None:

@@ -353,7 +353,7 @@ def test_intervals_hold_the_known_answer_as_often_as_they_say():
 @pytest.mark.parametrize("engine", ENGINES)
 def test_runs_that_diverge_are_counted_and_are_in_no_figure(robots, engine):
     robot = robots["ets_vii"]
-    given = START | {"tau_b.x.gain": [0.0, 0.0, -6.0]}
+    given = START | {"tau_b.x.gain": [0.0, 0.0, -60.0]}
     case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
     campaign = fflin.monte_carlo(robot, feedback(robot), given, **case)
     lost = int(campaign.stopped.sum())
@@ -378,7 +378,7 @@ def test_runs_that_diverge_are_counted_and_are_in_no_figure(robots, engine):
 @pytest.mark.compiled
 def test_lanes_stop_as_single_runs_do(robots):
     robot = robots["ets_vii"]
-    given = START | {"tau_b.x.gain": [0.0, -6.0]}
+    given = START | {"tau_b.x.gain": [0.0, -60.0]}
     lanes = both(robot, feedback(robot), given, runs=19, tolerance=1e-5, duration=9.0)
     assert {*lanes["stop"]} >= {0.0} and 0 < (lanes["stop"] > 0).sum() < 19
 
@@ -454,7 +454,7 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
     robot = robots["ets_vii"]
-    given = START | {"tau_b.x.gain": [0.0, 0.0, -6.0]}
+    given = START | {"tau_b.x.gain": [0.0, 0.0, -60.0]}
     case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
     campaign = fflin.monte_carlo(
         robot,

@@ -163,15 +163,22 @@ def test_energy_counts_gravity_and_springs_from_where_they_are_zero():
     np.testing.assert_allclose(motion.energy, expected, rtol=1e-7)
 
 
-def test_a_loop_that_leaves_the_chart_says_when():
+def test_a_loop_that_rotates_past_half_a_turn_says_when():
     # No feedback at all, and a turn of 1 rad/s: half a turn after pi seconds.
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     nothing = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
     v0 = fflin.velocity(robot, {"omega_b.z": 1.0})
     motion = fflin.simulate(robot, nothing, v0=v0, duration=10.0, dt=0.01)
-    assert motion.stopped.startswith("left the chart at t = 3.15 s")
-    assert motion.t[-1] == pytest.approx(3.15) and np.isfinite(motion.x).all()
+    assert motion.stopped == "" and motion.t[-1] == pytest.approx(10.0)
+    assert motion.linear is None
+    [note] = motion.notes
+    assert note.startswith("the base rotated past 180 deg from the reference at t = 3.15 s")
+    assert note.endswith("; the linear prediction is omitted, because it does not hold there")
+    # The angle t is the same rotation as t - 2 pi, and q_b is of the shorter one.
+    angle = np.mod(motion.t + np.pi, 2.0 * np.pi) - np.pi
+    np.testing.assert_allclose(motion.x[:, 2], np.sin(angle / 2.0), atol=1e-12)
+    np.testing.assert_allclose(motion.attitude_error, np.degrees(np.abs(angle)), atol=1e-5)
 
 
 def bent(robot):

@@ -205,21 +205,12 @@ def test_a_trajectory_is_followed_from_sample_to_sample(robots):
         both(robot, gains, dt=0.01, duration=0.4, v0=1.1 * v[0], q0=q[0])
 
 
-STOPS = {
-    "left the chart": lambda lin: {"x0": displaced(lin, degrees=60.0), "turn": 2.0},
-    "diverged": lambda lin: {"x0": displaced(lin), "gain": -3.0},
-}
-
-
-@pytest.mark.parametrize("words", STOPS)
-def test_a_run_stops_at_the_same_step_with_the_same_words(robots, words):
+def test_a_run_stops_at_the_same_step_with_the_same_words(robots):
     robot = robots["servicer_7dof"]
     policy = feedback(robot)
-    case = STOPS[words](policy.lin)
-    case["x0"][6 + robot.n] += case.pop("turn", 0.0)
-    policy = replace(policy, K=case.pop("gain", 0.0) * policy.K)
-    motion = both(robot, policy, tolerance=1e-6, **case)
-    assert motion.stopped.startswith(words)
+    policy = replace(policy, K=-3.0 * policy.K)
+    motion = both(robot, policy, tolerance=1e-6, x0=displaced(policy.lin))
+    assert motion.stopped.startswith("diverged")
     assert 20 < len(motion.t) < 1001
 
 

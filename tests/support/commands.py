@@ -18,6 +18,19 @@ def run(*arguments, cwd=None, **environment):
     In this process: the same code from the arguments to the exit code, without the half second
     that an interpreter and its packages take to start.
     """
+    code, said, complained = _called(arguments, cwd, environment)
+    return code, said, without_warnings(hear_lines(complained))
+
+
+def warned(*arguments, cwd=None):
+    """Call a command that succeeds; return its warnings."""
+    code, _, complained = _called(arguments, cwd, {})
+    assert code == 0, complained
+    start = "fflin: warning: "
+    return {x.removeprefix(start) for x in complained.splitlines() if x.startswith(start)}
+
+
+def _called(arguments, cwd, environment):
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with (
         mock.patch.dict(os.environ, environment),
@@ -32,7 +45,7 @@ def run(*arguments, cwd=None, **environment):
         except SystemExit as ended:
             code = ended.code or 0
     said, complained = (each.buffer.getvalue().decode() for each in (out, err))
-    return code, said, without_warnings(hear_lines(complained))
+    return code, said, complained
 
 
 def run_in_process(*arguments, cwd=None, **environment):
