@@ -304,12 +304,12 @@ def require_fixed_point(lin: LinearModel) -> None:
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     if lin.is_equilibrium():
         return
-    rate = lin.f0 if lin.drift is None else lin.drift
+    rate = lin.rate
     # The message lists the largest rates first. Their magnitudes are rounded, because the last
     # digits differ between processors and would change the order of equal rates.
     sizes = [float(f"{size:.5g}") for size in np.abs(rate).tolist()]
     shown = [
-        f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
+        f"d {lin.state_names[i]}/dt = {rate[i]:.6g}"
         for i in np.argsort(-np.array(sizes), kind="stable")
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]

@@ -217,7 +217,7 @@ class _Balance:
     def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
         self.lin = lin = linearizer(q, v)
-        drift = lin.f0 if lin.drift is None else lin.drift
+        drift = lin.rate
         _require_steady(lin, drift)
         columns = actuation.columns(robot.create_data(), lin.q)
         M, acceleration = lin.M, drift[-len(lin.M) :]

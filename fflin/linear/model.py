@@ -254,6 +254,19 @@ class LinearModel(ModelHeader, StateSpace):
             return None
         return self._source[1].generator
 
+    @property
+    def rate(self) -> Array:
+        """State derivative (nx,) at the operating point, also of a discrete-time model.
+
+        For a model with ``moving=True``, the value is `drift`, the state derivative of the
+        reference. For a discrete-time model, the value is f0 of its continuous-time model. If that
+        model is unknown (see `generator`), the value is f0 / dt, the mean over one sample.
+        """
+        if self.drift is not None:
+            return self.drift
+        source = self.generator
+        return self.f0 / self.dt if source is None else source.f0
+
     @cached_property
     def certificate(self) -> Certificate:
         """Residuals of the model, computed at the first access."""
@@ -297,8 +310,8 @@ class LinearModel(ModelHeader, StateSpace):
         `ignorable` move at constant rates, and all other coordinates are at rest. For example, a
         rotor spins, or the base has a constant velocity.
 
-        By default, the entries of f0 are tested. For a model with ``moving=True``, f0 is always
-        zero, so the motion of the reference is tested instead:
+        By default, the state derivative `rate` is tested. For a model with ``moving=True``, f0 is
+        always zero, so the motion of the reference is tested instead:
 
         - the velocities of the reference in base axes must be constant;
         - all joints except rotors must be at rest;
@@ -311,9 +324,8 @@ class LinearModel(ModelHeader, StateSpace):
             the tolerance is multiplied by the mean motion, because the gravity gradient causes only
             small accelerations.
         """
-        rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
-        return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
+        return bool(np.abs(self.rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
 
     def bound(self, tol: float) -> float:
         """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""

@@ -1,5 +1,6 @@
 """The regulator: weights by name, what it refuses, margins, sampled costs, files."""
 
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -359,6 +360,53 @@ def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():
     with pytest.raises(fflin.EquilibriumError, match=r"fflin\.tvlqr") as error:
         fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
     assert "moving=True" not in str(error.value)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("dt", [0.02, 3.0])
+def test_a_sampled_point_is_refused_with_the_rates_of_the_robot(moving, dt):
+    # Every body falls at g. A sample of A and f0 also moves the position, but the robot is at rest.
+    robot = fflin.load("planar_detumble", gravity=(0.0, 0.0, -9.81))
+    lin = fflin.linearize(robot, moving=moving)
+    stated = "not a fixed point: d v_b.z/dt = -9.81; "
+    designs = (
+        lambda: fflin.lqr(lin, 1, 1),
+        lambda: fflin.lqr(lin.discretize(dt), 1, 1),
+        lambda: fflin.mpc(lin, 1, 1, horizon=2, dt=dt),
+        lambda: fflin.kalman(lin.discretize(dt), 1.0, 1.0),
+    )
+    for design in designs:
+        with pytest.raises(fflin.EquilibriumError, match=re.escape(stated)):
+            design()
+
+
+def test_a_sampled_point_at_rest_has_no_rates_of_positions(tmp_path):
+    # A constant acceleration a moves the position by a dt^2 / 2 in a sample. The continuous model
+    # tells that the robot is at rest; a file of the sampled model knows only the mean rates.
+    robot = fflin.load("planar_detumble", inputs=[fflin.JointTorque("joint_1")])
+    lin = fflin.linearize(robot, u=[0.1])
+    dt, first = 0.02, lin.state_names.index("qdot_m.joint_1")
+    acceleration = f"d qdot_m.joint_1/dt = {lin.f0[first]:.6g}"
+    sampled = lin.discretize(dt)
+    sampled.save(tmp_path / "sampled.npz")
+    with pytest.raises(fflin.EquilibriumError, match=re.escape(acceleration)) as error:
+        fflin.lqr(sampled, 1, 1)
+    assert "d q_m" not in str(error.value)
+    loaded = fflin.LinearModel.load(tmp_path / "sampled.npz")
+    mean = loaded.rate[lin.state_names.index("q_m.joint_1")]
+    assert mean == pytest.approx(lin.f0[first] * dt / 2.0, rel=1e-12)
+
+
+def test_an_equilibrium_does_not_depend_on_the_sampling_time(tmp_path):
+    robot = fflin.load("planar_detumble")
+    pushed = fflin.effort(robot, {"F_b.z": 5e-9 * robot.mass})  # 5e-9 m/s^2; the limit is 1e-9
+    lin = fflin.linearize(robot, u=pushed)
+    assert not lin.is_equilibrium()
+    for dt in (1e-3, 0.1):
+        lin.discretize(dt).save(tmp_path / "sampled.npz")
+        for sampled in (lin.discretize(dt), fflin.LinearModel.load(tmp_path / "sampled.npz")):
+            assert not sampled.is_equilibrium()
+            assert sampled.is_equilibrium(6e-9)
 
 
 def test_a_weight_by_names_is_of_a_model():
