@@ -33,7 +33,7 @@ else:
 
 T = TypeVar("T")
 
-# Numbers in logs and files often have six decimals. If the length of a quaternion or (cos, sin) pair
+# Logs and files often have six decimals. If the length of a quaternion or of a (cos, sin) pair
 # differs from 1 by at most this value, the quaternion or pair is normalised. A larger difference
 # counts as wrong input. The positions and rates of mimic joints have the same tolerance.
 NORM_TOLERANCE = 1e-5
