@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.c_code import needs_compiler
 from tests.support.marks import exhaustive
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -15,11 +16,15 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 # Examples that fly many runs or search long.
 LONG = {"plot_funnel", "Funnel", "funnel", "plan", "plot_validity", "validity", "Validity"}
 LONG |= {"plot_campaign"}
+COMPILED = {"CLaw"}  # examples that call a C compiler
+NAMES = [
+    *(name for name in fflin.__all__ if name not in LONG | COMPILED),
+    *(pytest.param(name, marks=needs_compiler) for name in sorted(COMPILED)),
+    *exhaustive(*sorted(LONG)),
+]
 
 
-@pytest.mark.parametrize(
-    "name", [*(name for name in fflin.__all__ if name not in LONG), *exhaustive(*sorted(LONG))]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")

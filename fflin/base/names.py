@@ -12,6 +12,14 @@ _GROUPS = ("tau_b", "F_b", "tau_m")
 _OF_UNIT = {"N": "thrust", "N m": "wheel"}
 
 
+def undotted(name: str) -> str:
+    """Return a name for python-control, which reserves dots for the form `system.signal`.
+
+    Two names can become equal, such as ``q_m.a.b`` and ``q_m.a_b``.
+    """
+    return name.replace(".", "_")
+
+
 def group_of(name: str) -> str:
     """Return the GROUP of a name GROUP.ENTRY, or "" if the name has no group."""
     return name.partition(".")[0] if "." in name else ""

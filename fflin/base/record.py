@@ -23,7 +23,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
@@ -33,7 +33,7 @@ import numpy as np
 
 from fflin.base import writing
 from fflin.base.errors import FileError, InputError, MissingPackageError
-from fflin.base.validation import NORM_TOLERANCE, Array, Result
+from fflin.base.validation import Array, Result, normalised
 
 CHECKSUM = "sha256"
 
@@ -319,8 +319,6 @@ def require_possible(values: Record, shapes: str = "") -> None:
             raise ValueError(f"{key} is {value:g}, which is not possible")
         if key.endswith("_units") and len(value) != len(values[key.replace("units", "names")]):
             raise ValueError(f"the number of its {key} differs from the number of names")
-        if key == "placement" and not _is_pose(value):
-            raise ValueError("placement is not a position and a unit quaternion (7,)")
     lengths: dict[str, int] = {}
     for key, letters in (each.split(":") for each in shapes.split()):
         shape = np.shape(values[key])
@@ -328,8 +326,12 @@ def require_possible(values: Record, shapes: str = "") -> None:
             raise ValueError(f"{key} has shape {shape}, which contradicts other entries")
 
 
-def _is_pose(values: Array) -> bool:
-    return values.shape == (7,) and abs(float(np.linalg.norm(values[3:])) - 1.0) <= NORM_TOLERANCE
+def unit_pose(values: Array) -> Array:
+    """Return a pose from a file with a normalised quaternion, or raise `ValueError`."""
+    if values.shape == (7,):
+        with suppress(InputError):
+            return np.concatenate((values[:3], normalised("the quaternion", values[3:])))
+    raise ValueError("placement is not a position and a unit quaternion (7,)")
 
 
 def record_of(design: Design) -> Record:
@@ -364,4 +366,5 @@ def _value(item: Field[object], raw: object) -> Any:
     if item.type == "Open":
         array = np.where(np.abs(array) > _LARGEST, np.copysign(np.inf, array), array)
     # MATLAB stores vectors as matrices.
-    return array.ravel() if item.type in ("Vector", "Poles") else array
+    array = array.ravel() if item.type in ("Vector", "Poles") else array
+    return unit_pose(array) if item.name == "placement" else array

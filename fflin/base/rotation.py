@@ -29,6 +29,18 @@ def product(a: Array, b: Array) -> Array:
     return a.dot(b) if a.ndim == b.ndim == 2 else a @ b
 
 
+def row_products(rows: Array, matrix: Array) -> Array:
+    """Return ``rows @ matrix`` (N, k), where each row is rounded as if it were the only one.
+
+    BLAS rounds the product of a single row differently from the product of several rows. If a run
+    is computed alone and among others, its values must be equal bit for bit.
+    """
+    total: Array = rows[:, :1] * matrix[0]
+    for index in range(1, len(matrix)):
+        total = total + rows[:, index : index + 1] * matrix[index]
+    return total
+
+
 def quaternion_product(a: Array, b: Array) -> Array:
     """Return the Hamilton product ``a b`` (4,) of two quaternions, scaled to unit length."""
     ax, ay, az, aw = a.tolist()

@@ -33,9 +33,13 @@ else:
 
 T = TypeVar("T")
 
-# If the squared length of a quaternion or (cos, sin) pair differs from 1 by at most this value, the
-# quaternion or pair is normalised. A larger difference counts as wrong input.
-NORM_TOLERANCE = 1e-6
+# Logs and files often have six decimals. If the length of a quaternion or of a (cos, sin) pair
+# differs from 1 by at most this value, the quaternion or pair is normalised. A larger difference
+# counts as wrong input. The positions and rates of mimic joints have the same tolerance.
+NORM_TOLERANCE = 1e-5
+
+# Largest rounding error of the length of a normalised quaternion.
+ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
 
@@ -153,6 +157,19 @@ def dimension(name: str, value: object) -> int:
     return _as_array(name, value).ndim
 
 
+def normalised(what: str, value: Array) -> Array:
+    """Return a vector with length 1, such as a quaternion.
+
+    If the length is 1 to machine precision, the vector is returned unchanged. Raise `InputError` if
+    the length differs from 1 by more than `NORM_TOLERANCE`.
+    """
+    length = math.hypot(*value.tolist())
+    error = abs(length - 1.0)
+    if not error <= NORM_TOLERANCE:
+        raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
+    return value if error <= ROUND_OFF else value / length
+
+
 def placement(name: str, value: object) -> pin.SE3:
     """Return a copy of a placement with a normalised rotation, or raise `InputError`."""
     import pinocchio as pin
@@ -162,13 +179,24 @@ def placement(name: str, value: object) -> pin.SE3:
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(given.rotation):
         raise InputError(f"{name} is not a rotation matrix; expected R^T R = I and det R = 1")
+    return rotated(given)
+
+
+def rotated(given: pin.SE3) -> pin.SE3:
+    """Return a copy of a placement, whose matrix R is replaced by a rotation near to R."""
+    import pinocchio as pin
+
     return pin.SE3(pin.Quaternion(given.rotation).normalized().matrix(), given.translation)
 
 
 def is_rotation(R: Array) -> bool:
-    """Return whether R (3, 3) is a rotation matrix within 1e-6."""
+    """Return whether R (3, 3) is a rotation matrix within the tolerance of quaternions.
+
+    The entries of R^T R are squared lengths and products, and change by at most twice as much as
+    the lengths of the columns.
+    """
     skewed = float(np.abs(R.T @ R - np.eye(3)).max())
-    return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
+    return skewed <= 2.0 * NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
 
 def as_double(name: str, value: object) -> Array:

@@ -17,7 +17,7 @@ from fflin.base.errors import InputError, located
 from fflin.base.validation import Array, ArrayLike, frozen
 from fflin.dynamics.points import configuration
 from fflin.robot.fields import travel_of
-from fflin.robot.joints import ROUND_OFF, Joint, by_joint
+from fflin.robot.joints import Joint, by_joint
 from fflin.robot.robot import Robot
 
 # Rows are checked in blocks of this size, which limits the memory for intermediate results.
@@ -283,7 +283,7 @@ def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Confi
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
         # Rows that may be invalid. They include rows with NaN, because comparisons with NaN are
         # false.
-        doubtful = ~((excess <= ROUND_OFF) & np.isfinite(block).all(axis=1))
+        doubtful = ~((excess <= validation.ROUND_OFF) & np.isfinite(block).all(axis=1))
         if robot.followers:
             followed = block.copy()
             robot.follow(followed.T)

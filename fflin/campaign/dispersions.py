@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, group_of, input_keys
+from fflin.base.rotation import row_products
 from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
@@ -449,7 +450,7 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
-    return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
+    return np.column_stack((mass, mass[:, None] * row_products(com, axes), about[:, rows, columns]))
 
 
 def turned(direction: object, angles: Array) -> Array:
@@ -490,13 +491,13 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
             forces = [placement.act(pin.Force(_pointed(item, x).wrench)).vector for x in np.eye(3)]
             columns = np.column_stack(forces)
             parts = [tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)]
-            wrench[:, inputs.index(at)] += (after - before) @ np.concatenate(parts).T
+            wrench[:, inputs.index(at)] += row_products(after - before, np.concatenate(parts).T)
         if isinstance(item, ReactionWheel) and item.momentum:
-            stored[:, storing.index(body)] += item.momentum * (after - before) @ axes.T
+            stored[:, storing.index(body)] += item.momentum * row_products(after - before, axes.T)
         if isinstance(item, ReactionWheel) and item.inertia:
             wheel = names.index(own[0]) - ROOT
             fixed[:, wheel, :9] = [(axes @ turned_to(each)).ravel("F") for each in after]
-            a, b = after @ axes.T, axes @ before
+            a, b = row_products(after, axes.T), axes @ before
             change = np.outer(b, b) - a[:, :, None] * a[:, None]
             row, column = np.triu_indices(3)
             bodies[:, body, 4:] += item.inertia * change[:, row, column]

@@ -176,6 +176,9 @@ class Gain(ModelDesign):
         ------
         MissingPackageError
             If python-control is not installed.
+        InputError
+            If two signals differ only by a dot or an underscore, because python-control has no dots
+            in names.
         """
         return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
 

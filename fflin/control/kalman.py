@@ -98,6 +98,9 @@ class Estimator(ModelDesign):
         ------
         MissingPackageError
             If python-control is not installed.
+        InputError
+            If two signals differ only by a dot or an underscore, because python-control has no dots
+            in names.
         """
         L, both = self.L, (*self.input_names, *self.output_names)
         system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
@@ -151,6 +154,9 @@ class Compensator(ModelDesign):
         ------
         MissingPackageError
             If python-control is not installed.
+        InputError
+            If two signals differ only by a dot or an underscore, because python-control has no dots
+            in names.
         """
         names = self.state_names, self.input_names, self.output_names
         return state_space((self.A, self.B, self.C, 0.0), self.dt, *names)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fflin.base.errors import FileError, InputError, listed, located, unknown
+from fflin.base.names import undotted
 from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
@@ -378,16 +379,28 @@ def _indices(
         )
     if not named:
         return list(range(size))
-    own, there = list(names), list(known)
-    if not {*own} <= {*there}:
-        # Names in python-control cannot contain dots, so underscores may replace the dots.
-        own, there = ([name.replace(".", "_") for name in each] for each in (own, there))
-    for name, key in zip(names, own, strict=True):
-        if key not in there:
-            text = unknown(f"{of} of the model", name, known)
-            raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
-        if own.count(key) > 1:
+    found = list[int]()
+    for name in names:
+        index = _index(kind, name, of, known)
+        if index in found:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"
             )
-    return [there.index(key) for key in own]
+        found.append(index)
+    return found
+
+
+def _index(kind: str, name: str, of: str, known: Sequence[str]) -> int:
+    """Return the index of a controller's signal among the names `known` of the model."""
+    # Names in python-control cannot contain dots, so underscores may replace the dots.
+    fits = [each for each in known if undotted(each) == undotted(name)]
+    fits = [name] if name in fits else fits
+    if not fits:
+        text = unknown(f"{of} of the model", name, known)
+        raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
+    if len(fits) > 1:
+        raise InputError(
+            f"{kind} '{name}' of the controller is ambiguous, because an underscore may replace a "
+            f"dot: it fits '{fits[0]}' and '{fits[1]}'; give the {kind} the name of the model"
+        )
+    return known.index(fits[0])

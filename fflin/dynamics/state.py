@@ -299,8 +299,8 @@ class StateMap:
         relative = np.concatenate((x[:, g.q_b], np.sqrt(square)), axis=1)
         chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
-        q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ turning.product_matrix(self.origin_quaternion)
+        q[:, :3] = turning.row_products(x[:, g.r_b] - self._position, self._rotation)
+        turned = turning.row_products(relative, turning.product_matrix(self.origin_quaternion))
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles * self._scale[6:]

@@ -26,7 +26,7 @@ import pinocchio as pin
 from fflin.base import record
 from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
-from fflin.base.validation import as_double, frozen, vector
+from fflin.base.validation import as_double, frozen, normalised, vector
 from fflin.base.writing import RECORDS, check_ending, csv_table, read_file, write_atomically
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.state import Actuation, StateMap
@@ -140,7 +140,7 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
         fields |= {
             "moving": bool(fields["moving"]),
             "verified": verified,
-            "placement": fields.pop("reference"),
+            "placement": frozen(record.unit_pose(fields.pop("reference"))),
             "drift": drift if drift.size else None,
             "_inertia": partial(given, fields.pop("M")),
             "_ignorable": partial(given, fields.pop("ignorable")),
@@ -224,7 +224,10 @@ def arguments(
         raise FileError(
             f"the file has the entries {found}; expected t, u, and either x or both q and v"
         )
-    reference = pin.XYZQUATToSE3(np.ravel(entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0])))
+    pose = as_double("placement", entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0]))
+    pose = vector("placement", pose.ravel(), 7, "a position and a quaternion x, y, z, w")
+    quaternion = normalised("the quaternion placement[3:7]", pose[3:])
+    reference = pin.XYZQUATToSE3(np.concatenate((pose[:3], quaternion)))
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, optional_package
+from fflin.base.names import undotted
 from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
 from fflin.base.writing import as_path
 from fflin.dynamics.integrators import held_exponential
@@ -401,6 +402,9 @@ class LinearModel(ModelHeader, StateSpace):
         ------
         MissingPackageError
             If python-control is not installed.
+        InputError
+            If two signals differ only by a dot or an underscore, because python-control has no dots
+            in names.
         ModelError
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
@@ -449,9 +453,23 @@ class LinearModel(ModelHeader, StateSpace):
 def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
-    # Replace the dots in names, because python-control reserves dots for the form `system.signal`.
-    states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
+    kinds = ("states", "inputs", "outputs")
+    states, inputs, outputs = (_labels(*each) for each in zip(kinds, signals, strict=True))
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
+
+
+def _labels(kind: str, names: Sequence[str]) -> list[str]:
+    """Return names for python-control, or raise `InputError` if two signals get the same name."""
+    found = dict[str, str]()
+    for name in names:
+        label = undotted(name)
+        if label in found:
+            raise InputError(
+                f"the {kind} '{found[label]}' and '{name}' both get the name '{label}' in "
+                "python-control, whose names contain no dots; rename one of them, such as its joint"
+            )
+        found[label] = name
+    return list(found)
 
 
 def refuse_sampled(dt: float, do: str) -> None:

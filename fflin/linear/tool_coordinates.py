@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, unknown
 from fflin.base.rotation import product_matrix, quaternion_product, rotation_matrix, skew
-from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, placement, vector
+from fflin.base.validation import Array, ArrayLike, normalised, placement, vector
 from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
@@ -159,12 +159,8 @@ class ToolCoordinates:
             R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
             R = placement("R0 (q[:9] by columns)", R0).rotation
             return R
-        length = float(np.linalg.norm(attitude))
-        if abs(length - 1.0) > NORM_TOLERANCE:
-            raise InputError(
-                f"the quaternion w, x, y, z has length {length:.9g}, expected 1; normalise it"
-            )
-        return rotation_matrix(np.roll(attitude, -1) / length)
+        attitude = normalised("the quaternion w, x, y, z", attitude)
+        return rotation_matrix(np.roll(attitude, -1))
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude of the tool's base as a quaternion x, y, z, w and as a matrix.

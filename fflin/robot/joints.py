@@ -14,12 +14,9 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import NORM_TOLERANCE, Array, ArrayLike, vector
+from fflin.base.validation import NORM_TOLERANCE, ROUND_OFF, Array, ArrayLike, normalised, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
-
-# Largest rounding error of the length of a normalised quaternion.
-ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # A `pin.Data` takes about 32 nv^3 bytes, because it contains four tensors with nv^3 entries each.
 _DATA_BYTES_PER_NV3 = 32
@@ -198,9 +195,9 @@ class Coordinates:
     def checked_configuration(self, q: ArrayLike) -> Array:
         """Return q (nq,) with small errors corrected; raise `InputError` for larger errors.
 
-        The base quaternion and each pair (cos, sin) are scaled to length 1 if the squared length
-        differs from 1 by at most 1e-6. Mimic joints that deviate by at most 1e-6 are corrected to
-        the positions that follow from their leaders.
+        The base quaternion and each pair (cos, sin) are scaled to length 1 if the length differs
+        from 1 by at most 1e-5. Mimic joints that deviate by at most 1e-5 are corrected to the
+        positions that follow from their leaders.
         """
         near = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
         if not pin.isNormalized(self.model, near, ROUND_OFF):
@@ -208,10 +205,7 @@ class Coordinates:
             for at, name in self.unbounded.items():
                 parts[at, at + 2] = f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
             for (first, last), what in parts.items():
-                square = sum(entry * entry for entry in near[first:last].tolist())
-                if abs(square - 1.0) > NORM_TOLERANCE:
-                    length = math.sqrt(square)
-                    raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
+                normalised(what, near[first:last])
             near = pin.normalize(self.model, near)
         return self._followed(near) if self.followers else near
 
@@ -239,7 +233,7 @@ class Coordinates:
     def _followed(self, q: Array) -> Array:
         """Return a copy of q (nq,) in which each mimic joint follows its leader exactly.
 
-        Raise `InputError` if a mimic joint in q deviates by more than 1e-6.
+        Raise `InputError` if a mimic joint in q deviates by more than 1e-5.
         """
         placed = q.copy()
         self.follow(placed)

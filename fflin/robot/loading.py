@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
 from fflin.base.toml_file import TomlFile, flat
-from fflin.base.validation import instance, is_rotation
+from fflin.base.validation import instance, is_rotation, rotated
 from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
@@ -32,6 +32,10 @@ from fflin.robot.urdf.reader import SIZE_LIMIT, describe, ignored
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
+
+# If R^T R differs from I by more than this value, the placement was not computed in double
+# precision, but has a few decimals.
+_SKEWED = 1e-12
 
 # Fields that are arrays of tables in a robot file: {field: names of the arrays}. For example, the
 # tables [[input]] give the field `inputs`.
@@ -205,6 +209,7 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     _check_model(copy, name)
+    _normalise_placements(copy)
     robot = _robot(copy, name, requested(lock), {})
     return robot.replace(**fields) if fields else robot
 
@@ -270,6 +275,19 @@ def _check_model(model: pin.Model, name: str) -> None:
         }
         for fault in (fault for fault, found in faults.items() if found):
             raise ModelError(f"'{name}': joint '{model.names[index]}' has {fault}; correct it")
+
+
+def _normalise_placements(model: pin.Model) -> None:
+    """Replace the matrices R of joints and frames that are rotations only to a few decimals."""
+    for index in range(ROOT, model.njoints):
+        model.jointPlacements[index] = _normalised(model.jointPlacements[index])
+    for frame in model.frames:
+        frame.placement = _normalised(frame.placement)
+
+
+def _normalised(given: pin.SE3) -> pin.SE3:
+    error = np.abs(given.rotation.T @ given.rotation - np.eye(3)).max()
+    return rotated(given) if error > _SKEWED and is_rotation(given.rotation) else given
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:

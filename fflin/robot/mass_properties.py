@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name, matching
-from fflin.base.rotation import skew
+from fflin.base.rotation import row_products, skew
 from fflin.base.validation import Array, instance, number, positive, shaped, vector, whole
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
@@ -147,7 +147,7 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     # shifts it.
     T = np.zeros((len(com), 4, 4))
     T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
-    T[:, :3, 3] = body.lever + com @ axes.T - T[:, :3, :3] @ body.lever
+    T[:, :3, 3] = body.lever + row_products(com, axes.T) - T[:, :3, :3] @ body.lever
     T[:, 3, 3] = 1.0
     P: Array = body.toPseudoInertia().toMatrix()
     return (1.0 + density)[:, None, None] * (T @ P @ T.swapaxes(1, 2))
@@ -258,7 +258,8 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     """
     body = as_inertia(piece)
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
-    center = np.concatenate((body.lever + com @ piece.frame.rotation.T, np.ones((len(com), 1))), 1)
+    moved = body.lever + row_products(com, piece.frame.rotation.T)
+    center = np.concatenate((moved, np.ones((len(com), 1))), axis=1)
     added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
     changes: Array = after + added - body.toPseudoInertia().toMatrix()
     return changes

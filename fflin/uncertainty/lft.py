@@ -181,6 +181,9 @@ class LFT(Design):
         ------
         MissingPackageError
             If python-control is not installed.
+        InputError
+            If two signals differ only by a dot or an underscore, because python-control has no dots
+            in names.
         """
         channels = [
             f"{name}.{at + 1}"

@@ -175,16 +175,17 @@ def visualize(
         if opened is not False:
             live.open()
         return live
-    outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     from fflin.analysis.modes import Modes
     from fflin.view.pages import mode_page, motion_page
 
+    # This error comes before the error that Chromium is not installed, because modes never need it.
+    if isinstance(motion, Modes) and (png is not None or gif is not None):
+        raise InputError(
+            "png or gif is given, but modes can be shown only in an HTML page; give html="
+        )
+    outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
-        if {*outputs} - {".html"}:
-            raise InputError(
-                "png or gif is given, but modes can be shown only in an HTML page; give html="
-            )
         found, notes = mode_page(robot, motion, scene, tool)
     else:
         robot = _robot_of(robot, motion)

@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 import fflin
+from fflin.control.gain import ACCURACY
 from fflin.control.plots import input_loops
 from tests.support.weights import unit_weights
 
@@ -96,3 +98,95 @@ def test_what_is_not_regulated_has_no_part_in_the_loops():
             closed = np.linalg.inv(1j * grid[k] * np.eye(len(fed)) - A + B[:, others] @ K[others])
             assert values[k, i] == pytest.approx((K[i] @ closed @ B[:, i]), rel=1e-6)
     assert all(loop.phase > 59.9 for loop in loops)
+
+
+def loop_of(gain):
+    """The regulated states' A, B and K, with inputs scaled by sqrt(R_ii)."""
+    fed = [gain.state_names.index(name) for name in gain.regulated]
+    scale = np.sqrt(gain.R.diagonal())
+    return gain.A[np.ix_(fed, fed)], gain.B[fed] / scale, scale[:, None] * gain.K[:, fed]
+
+
+def balance(gain, frequencies):
+    """Return half of S - T at the scaled inputs, from the open loop K (s - A)^-1 B."""
+    A, B, K = loop_of(gain)
+    s = 1j * np.asarray(frequencies)
+    s = (np.exp(s * gain.dt) if gain.dt else s)[..., None, None]
+    L = K @ np.linalg.solve(s * np.eye(len(A)) - A, B)
+    unit = np.eye(len(K))
+    return 0.5 * (unit - L) @ np.linalg.inv(unit + L)
+
+
+def swept(gain):
+    """Return the largest gain of half of S - T, and its frequency, from a sweep of frequencies."""
+    most = np.pi / gain.dt if gain.dt else 1e3
+    grid = np.geomspace(1e-6 * most, most, 600)
+    sizes = np.linalg.norm(balance(gain, grid), 2, axis=(1, 2))
+    found = [(sizes[0], grid[0]), (sizes[-1], grid[-1])]
+    inner = 1 + np.flatnonzero((sizes[1:-1] >= sizes[:-2]) & (sizes[1:-1] >= sizes[2:]))
+    for at in sorted(inner, key=lambda at: -sizes[at])[:3]:
+        peak = minimize_scalar(
+            lambda w: -np.linalg.norm(balance(gain, w), 2),
+            bounds=grid[[at - 1, at + 1]],
+            method="bounded",
+        )
+        found.append((-peak.fun, peak.x))
+    return max(found)
+
+
+def beyond(gain, factors):
+    """How far the poles are beyond the limit with factors (nu, nu) at the scaled inputs."""
+    A, B, K = loop_of(gain)
+    poles = np.linalg.eigvals(A - B @ factors @ K)
+    return np.abs(poles).max() - 1.0 if gain.dt else poles.real.max()
+
+
+def factors_of(delta):
+    """Return the factors (1 - delta/2)^-1 (1 + delta/2) of a point of the disk."""
+    unit = np.eye(len(delta))
+    return np.linalg.solve(unit - 0.5 * delta, unit + 0.5 * delta)
+
+
+def flexible():
+    """A loop with weakly damped vibrations."""
+    return fflin.linearize(fflin.load("servicer_7dof", stiffness={"panel_*": 100.0}))
+
+
+DISKS = {
+    "continuous": lambda: fflin.linearize(fflin.load("canadarm2")),
+    "upright": hovering,
+    "flexible": flexible,
+    "sampled": lambda: fflin.linearize(fflin.load("canadarm2")).discretize(0.5),
+    "sampled upright": lambda: hovering().discretize(0.02),
+    "sampled flexible": lambda: flexible().discretize(0.1),
+}
+
+
+@pytest.mark.parametrize("case", DISKS)
+def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case):
+    lin = DISKS[case]()
+    rng = np.random.default_rng(0)
+    for weights in ((), unit_weights(lin)):
+        gain = fflin.lqr(lin, *weights)
+        disk, (low, high), phase = gain.margins
+        size, frequency = swept(gain)
+        # The largest gain of the code is accurate to ACCURACY, and the refined sweep is better.
+        assert abs(disk * size - 1.0) < 2.0 * ACCURACY
+        # For the factors F of delta, I + F L is singular where I - delta (S - T)/2 is singular.
+        # The smallest such delta has rank one.
+        u, _, v = np.linalg.svd(balance(gain, frequency))
+        worst = np.outer(v[0].conj(), u[:, 0].conj())
+        assert beyond(gain, factors_of(1.001 * disk * worst)) > 0.0
+        assert beyond(gain, factors_of(0.999 * disk * worst)) < 0.0
+        # No other point of the disk makes the loop unstable.
+        for _ in range(30):
+            delta = rng.normal(size=(2, len(u), len(u)))
+            delta = delta[0] + 1j * delta[1]
+            delta *= 0.999 * disk / np.linalg.norm(delta, 2)
+            assert beyond(gain, factors_of(delta)) < 0.0
+            gains = np.exp(rng.uniform(np.log(low), np.log(high), len(u)))
+            turns = np.radians(rng.choice([-0.999, 0.999], len(u)) * phase)
+            assert beyond(gain, np.diag(gains)) < 0.0 > beyond(gain, np.diag(np.exp(1j * turns)))
+        # The limits of gain and phase are on the edge of the disk.
+        for factor in (low, high, np.exp(1j * math.radians(phase))):
+            assert abs(2.0 * (factor - 1.0) / (factor + 1.0)) == pytest.approx(disk, rel=1e-12)

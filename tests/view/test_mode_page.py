@@ -154,7 +154,8 @@ def test_it_plays_at_a_rate_to_be_watched(shown):
     assert text.startswith("shown at 0.50 Hz, ")
 
 
-def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path):
+def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # without Chromium the reasons are the same
     page, bent = tmp_path / "m.html", fflin.load("servicer_7dof", stiffness=STIFF)
     rigid = robots["ets_vii"]
     found = fflin.modes(fflin.linearize(bent))
