@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis import mechanics, ranks
+from fflin.analysis import along_motion, mechanics, moving_points, ranks
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.mechanics import ConservedMomenta, combination
 from fflin.analysis.observability import observability
@@ -20,6 +20,7 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array, Values
+from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
 _LOOPS = (
@@ -41,6 +42,11 @@ class Controllability(ranks.RankAnalysis):
     ----------
     dimension : int
         Dimension of the controllable subspace.
+    bound : int
+        Largest possible dimension along the motion. It equals `dimension`, unless `method` is
+        "frozen".
+    duration : float
+        Duration [s] of the analysed trajectory; 0 for the model of one operating point.
     controllable : tuple of str
         Names of states that the inputs can set independently; there are `dimension` of them. Within
         the controllable subspace, their values determine the whole state, ``x = basis @ values``.
@@ -54,16 +60,20 @@ class Controllability(ranks.RankAnalysis):
         and the other states named in `controllable` are 0.
     fixed_poles : ndarray (nx - dimension,)
         Poles that no feedback can move: [1/s] for a continuous model, discrete-time poles z for a
-        sampled one.
-    stabilizable : bool
-        Whether all fixed poles are stable.
+        sampled one. Empty for a trajectory, which has no poles.
+    stabilizable : bool or None
+        Whether all fixed poles are stable. At a point that the robot leaves, and along a
+        trajectory: True if the inputs control all states, False if they cannot change a conserved
+        momentum, and None if this is undecided.
     reach : dict
         Numbers of independent directions that the inputs can control, with the keys
         ``"base attitude"``, ``"base position"`` and ``"joints"``. The inputs can bring the position
         states to any value along these directions, if the final values of all other states are left
         free.
     method : str
-        Method that determined the dimension: "closed form", "modes" or "eigenvalues".
+        Method that determined the dimension: "closed form", "modes", "eigenvalues", "frozen" or
+        "Gramian". With "frozen", the dimension is valid only for A and B at the operating point,
+        which the robot leaves. With "Gramian", it is valid along the given trajectory.
     margin : Margin
         Certainty of the rank decisions, as two ratios: the smallest singular value counted as
         nonzero, divided by its tolerance, and the largest singular value counted as zero, divided
@@ -82,7 +92,7 @@ class Controllability(ranks.RankAnalysis):
 
     controllable: tuple[str, ...]
     uncontrollable: tuple[str, ...]
-    stabilizable: bool
+    stabilizable: bool | None
     reach: dict[str, int]
 
     def __str__(self) -> str:
@@ -92,11 +102,13 @@ class Controllability(ranks.RankAnalysis):
             lines.append(f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}")
             placed = [f"{what} {count}" for what, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")
-        decays = f"{'' if self.stabilizable else 'not '}stabilizable"
-        return self._summary("controllable", decays, lines)
+        conserved = self.uncontrollable[: len(self.basis) - self.bound]
+        limit = f"no input can change {listed(mechanics.grouped(conserved))}"
+        decays = ranks.verdict(self.stabilizable, "stabilizable")
+        return self._summary("controllable", limit, decays, lines)
 
 
-def controllability(lin: LinearModel) -> Controllability:
+def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     r"""Determine the controllable subspace from the structure of the model.
 
     Let :math:`x_1` be the positions and :math:`\nu` the velocities, with :math:`\dot x_1 = N \nu`,
@@ -112,9 +124,20 @@ def controllability(lin: LinearModel) -> Controllability:
       :math:`M a + D v + K s = S u` with positions s, damping D and stiffness K, by the rank of
       :math:`[p^2 M + p D + K, S]` at each pole p. In this matrix, entries that are zero to within
       rounding error are set to zero, and rows longer than 1 are scaled to length 1.
-    - At nonzero velocity, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
+    - In a steady motion, or if springs or dampers are not symmetric, the Popov-Belevitch-Hautus
       test is applied: the rank of :math:`[A - p I, B]` at each pole p is found from its singular
       values, with the states scaled to units of energy.
+    - At any other point, A and B change along the motion, and their rank at one instant proves
+      nothing about the motion. If no input exerts a net force on the robot, the linear momentum and
+      the centre of mass are separated first, and the angular momentum if no input exerts a net
+      moment either; see (9.6) of docs/derivation.md. No input changes these nine states, in motion
+      as at rest. If the inputs accelerate all coordinates independently, all states are
+      controllable. Otherwise the rest is tested with A and B frozen at the operating point. `bound`
+      is then the number of states without the conserved ones, `method` is "frozen", and the result
+      is never stabilizable.
+    - Along a trajectory, the rank of the finite-horizon controllability Gramian is found, with the
+      inputs constant between the knots. The result describes the errors at the last knot that the
+      inputs can reach from zero error at the first knot.
 
     A sampled model has the controllable subspace of its continuous model, with one exception:
     sampling may map two poles to one, and the inputs may then control only one of the two modes.
@@ -128,9 +151,9 @@ def controllability(lin: LinearModel) -> Controllability:
 
     Parameters
     ----------
-    lin : LinearModel
+    lin : LinearModel or LinearTrajectory
         Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
-        accepted.
+        accepted. A `LinearTrajectory` is analysed over its whole duration.
 
     Returns
     -------
@@ -141,13 +164,13 @@ def controllability(lin: LinearModel) -> Controllability:
     Raises
     ------
     InputError
-        If `lin` is not a `LinearModel`, or its states are not positions followed by their rates.
+        If `lin` is not a `LinearModel` or `LinearTrajectory`, its states are not positions followed
+        by their rates, or it was loaded from a file and its operating point is not an equilibrium,
+        so that the conserved momenta are unknown.
 
     Notes
     -----
-    All inputs, including thrusters, are assumed to act in both directions. At a nonzero angular
-    velocity, the result applies to the model with A and B frozen at the operating point. The motion
-    itself may be uncontrollable even if this frozen model is controllable. At nonzero velocity,
+    All inputs, including thrusters, are assumed to act in both directions. At nonzero velocity,
     poles with a modulus below about 1e-8 times the largest modulus are treated as zero.
 
     References
@@ -162,8 +185,19 @@ def controllability(lin: LinearModel) -> Controllability:
     >>> found = fflin.controllability(fflin.linearize(arm))
     >>> found.dimension, found.stabilizable
     (6, False)
+
+    In motion, the six momenta and the centre of mass remain uncontrollable:
+
+    >>> v = fflin.velocity(arm, {"joint_1": 0.1})
+    >>> found = fflin.controllability(fflin.linearize(arm, v=v))
+    >>> found.bound, found.method, found.stabilizable
+    (9, 'frozen', False)
     """
+    if isinstance(lin, LinearTrajectory):
+        return _along(lin)
     lin = mechanics.checked(lin)
+    if not lin.is_equilibrium():
+        return _in_motion(lin)
     conserved, size = mechanics.conserved(lin), np.tile(np.sqrt(lin.M.diagonal()), 2)
     found = _by_second_order(lin, conserved)
     if found is None:
@@ -174,50 +208,158 @@ def controllability(lin: LinearModel) -> Controllability:
     controllable, rows, names, method, fixed = found
     if names is None:
         z = conserved.selected
-        rows = ranks.echelon(rows.T, 1.0 / size[z])[0].T
-        states = tuple(lin.state_names[i] for i in z)
-        names = [combination(row, states, 1.0 / size[z]) for row in rows]
+        rows, names = _named(rows, tuple(lin.state_names[i] for i in z), size[z])
     others: Array = np.zeros((len(rows), len(lin.A)))
     others[:, conserved.selected] = rows
-    # Name the controllable states by coordinates on which an input acts directly, if possible.
-    driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
-    basis, pivots = ranks.echelon(conserved.T @ controllable, size, np.tile(driven, 2))
-    zero = np.full(2 * len(conserved.weights), 1.0 if lin.dt else 0.0)
+    zero = moving_points.constant_poles(2 * len(conserved.weights), lin.dt)
     margin = conserved.margin & fixed.margin.transformed(conserved.rates)
     fixed = fixed._replace(margin=margin, settling=fixed.settling.transformed(conserved.rates))
     if len(zero):
         fixed = fixed._replace(decays=False, settling=ranks.Margin())
-    groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
-    titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
-    weighted = (basis * size[:, None])[: len(groups)]
     momenta, notes = mechanics.momentum_names(lin, conserved), list[str]()
     rotates = any("angular momentum" in name for name in momenta)
-    if rotates and any(groups[conserved.kept] == "q_m"):
+    kept = [lin.state_names[i] for i in conserved.kept]
+    if rotates and any(name.startswith("q_m.") for name in kept):
         notes.append(_LOOPS)
     if momenta:
         notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
-    if not lin.is_equilibrium():
-        notes.append(
-            "the operating point is not an equilibrium, so the result is valid only for A and B "
-            "frozen at this point"
-        )
-    notes += mechanics.undecided(lin, fixed, "controllable", basis.shape[1], "stabilizable")
-    return Controllability(
-        dimension=basis.shape[1],
-        controllable=tuple(lin.state_names[i] for i in pivots),
+    dimension = controllable.shape[1]
+    notes += moving_points.steadiness(lin)
+    notes += mechanics.undecided(lin, fixed, "controllable", dimension, "stabilizable")
+    return _result(
+        lin,
+        conserved.T @ controllable,
+        bound=dimension,
         uncontrollable=(*momenta, *names),
         rows=np.vstack((conserved.momenta, conserved.coordinates, others)),
-        basis=basis,
         fixed_poles=np.concatenate((zero, fixed.poles)),
         stabilizable=fixed.decays,
+        method=method,
+        margin=fixed.margin,
+        notes=tuple(notes),
+    )
+
+
+def _in_motion(lin: LinearModel) -> Controllability:
+    """Determine the controllable subspace at a point that is not an equilibrium.
+
+    The conserved momenta are exact, so they are taken out first. Unless the inputs accelerate all
+    coordinates independently, the rest is decided by A and B at this point. This rank does not
+    decide about the motion, so it never makes the result stabilizable.
+    """
+    nx = len(lin.A)
+    conserved = moving_points.conserved(lin)
+    count = len(conserved.rows)
+    notes = moving_points.steadiness(lin)
+    margin = None if count else moving_points.all_coordinates_driven(lin)
+    if margin is not None:
+        return _result(
+            lin,
+            np.eye(nx),
+            bound=nx,
+            uncontrollable=(),
+            rows=np.zeros((0, nx)),
+            fixed_poles=np.zeros(0),
+            stabilizable=True,
+            method="closed form",
+            margin=margin,
+            notes=(moving_points.NOTE_AT_ONCE, *notes),
+        )
+    X = mechanics.rate_matrix(lin)
+    inside, _, rows, fixed = split_by_poles(X, lin.B, lin.M, lin.dt, known=conserved.rows)
+    rows, names = _named(rows, lin.state_names, np.tile(np.sqrt(lin.M.diagonal()), 2))
+    zero = moving_points.constant_poles(count, lin.dt)
+    fixed = fixed._replace(settling=ranks.Margin())  # the frozen poles do not decide about decay
+    undecided = mechanics.undecided(lin, fixed, "controllable", inside.shape[1])
+    return _result(
+        lin,
+        inside,
+        bound=nx - count,
+        uncontrollable=(*conserved.names, *names),
+        rows=np.vstack((conserved.rows, rows)),
+        fixed_poles=np.concatenate((zero, fixed.poles)),
+        stabilizable=False if count else None,
+        method=ranks.FROZEN,
+        margin=fixed.margin,
+        notes=(moving_points.NOTE, *notes, *undecided),
+    )
+
+
+def _along(traj: LinearTrajectory) -> Controllability:
+    """Determine which errors at the end of a trajectory its inputs can set."""
+    _, last = along_motion.ends(traj)
+    conserved = moving_points.conserved(last)
+    split = along_motion.reachable(traj, conserved.rows)
+    size = np.tile(np.sqrt(last.M.diagonal()), 2)
+    rows, names = _named(split.rest.T @ split.from_x, last.state_names, size)
+    lost = np.vstack((conserved.rows, rows))
+    dimension = split.image.shape[1]
+    fixed = ranks.FixedPoles(margin=split.margin)
+    stabilizable = None if len(lost) else True
+    return _result(
+        last,
+        split.to_x @ split.image,
+        bound=dimension,
+        duration=float(traj.t[-1] - traj.t[0]),
+        uncontrollable=(*conserved.names, *names),
+        rows=lost,
+        fixed_poles=np.zeros(0),
+        stabilizable=False if len(conserved.rows) else stabilizable,
+        method=ranks.GRAMIAN,
+        margin=split.margin,
+        notes=mechanics.undecided(last, fixed, "controllable", dimension),
+    )
+
+
+def _named(rows: Array, states: Sequence[str], size: Array) -> tuple[Array, list[str]]:
+    """Return uncontrollable combinations of states in echelon form, and their names.
+
+    `size` (nx,) makes the states comparable, as in `SecondOrder.size`.
+    """
+    rows = ranks.echelon(rows.T, 1.0 / size)[0].T
+    return rows, [combination(row, tuple(states), 1.0 / size) for row in rows]
+
+
+def _result(
+    lin: LinearModel,
+    controllable: Array,
+    *,
+    bound: int,
+    uncontrollable: tuple[str, ...],
+    rows: Array,
+    fixed_poles: Values,
+    stabilizable: bool | None,
+    method: str,
+    margin: ranks.Margin,
+    notes: tuple[str, ...],
+    duration: float = 0.0,
+) -> Controllability:
+    """Return the result for the controllable subspace with the basis `controllable` (nx, d)."""
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    # Name the controllable states by coordinates on which an input acts directly, if possible.
+    driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
+    basis, pivots = ranks.echelon(controllable, size, np.tile(driven, 2))
+    groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
+    titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
+    weighted = (basis * size[:, None])[: len(groups)]
+    return Controllability(
+        dimension=basis.shape[1],
+        bound=bound,
+        duration=duration,
+        controllable=tuple(lin.state_names[i] for i in pivots),
+        uncontrollable=uncontrollable,
+        rows=rows,
+        basis=basis,
+        fixed_poles=fixed_poles,
+        stabilizable=stabilizable,
         reach={
             title: ranks.image(ranks.unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
             for group, title in titles.items()
             if group in groups
         },
         method=method,
-        margin=fixed.margin,
-        notes=tuple(notes),
+        margin=margin,
+        notes=notes,
         robot=lin.robot,
     )
 

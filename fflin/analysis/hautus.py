@@ -11,7 +11,7 @@ from operator import itemgetter
 import numpy as np
 
 from fflin.analysis import ranks
-from fflin.analysis.mechanics import SecondOrder, rates_of_positions
+from fflin.analysis.mechanics import SecondOrder, energy_units, rates_of_positions
 from fflin.base.validation import Array, Values
 
 # Singular values of [A - s I, B] are computed only at s = 0 and at suspicious eigenvalues s of A.
@@ -50,32 +50,35 @@ _DEAD = 1e4 * ranks.EPS
 
 
 def split_by_poles(
-    X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False
+    X: Array,
+    drive: Array,
+    M: Array,
+    dt: float,
+    *,
+    known: Array | None = None,
+    dual: bool = False,
 ) -> tuple[Array, Array, Array, ranks.FixedPoles]:
     """Split the state space by the left null vectors of [A - s I, B] at each eigenvalue s of A.
 
-    Return four results:
+    The rows of `known` (k, nx) are combinations of states that are known to be uncontrollable. They
+    are taken out of the state space first, so nx - k replaces nx in the shapes of the following
+    four results, except for the number of rows or columns that refer to states:
 
     - a basis (nx, d) of the controllable subspace;
     - a basis (nx, nx - d) of a complement of this subspace;
     - a matrix (nx - d, nx), each row of which is an uncontrollable combination of states;
     - the fixed poles.
 
-    If `dual`, the pair (A^T, C^T) replaces (A, B). The second result is then a basis of the
-    unobservable subspace, and the first and third results have no meaning.
+    If `dual`, the pair (A^T, C^T) replaces (A, B), and the rows of `known` are unobservable
+    motions. The second result is then a basis of the other unobservable motions, and the first and
+    third results have no meaning.
     """
     # X is A, or (A - I)/dt of a sampled model. The matrix `drive` is B, or C^T of the dual pair.
-    # The states x = to_x xi are scaled to states xi in units of energy. Velocities nu become
-    # L^T nu with M = L L^T: the squared length of L^T nu is twice the kinetic energy. Positions p
-    # with dp/dt = N nu become L^T N^-1 p, divided by a unit of time. This unit is chosen so that
-    # the scaled A has a norm of about 1.
+    # The states x = to_x xi are scaled to states xi in units of energy. Positions are also divided
+    # by a unit of time, which is chosen so that the scaled A has a norm of about 1.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
-    L = np.linalg.cholesky(M)
-    N = rates_of_positions(X)
-    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
-    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
-    from_x = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
+    to_x, from_x = energy_units(M, rates_of_positions(X))
     A = from_x @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
@@ -101,6 +104,10 @@ def split_by_poles(
     A, to = (A.T, to_x.T) if dual else (A, from_x)
     B = ranks.unit_columns(to @ drive)
     inside, margin = np.eye(2 * nv), ranks.Margin()
+    if known is not None and len(known):
+        taken = known @ (from_x.T if dual else to_x)
+        taken /= np.linalg.norm(taken, axis=1, keepdims=True)
+        inside = np.linalg.qr(taken.T, mode="complete")[0][:, len(known) :]
     rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
         lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)

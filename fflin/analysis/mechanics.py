@@ -171,6 +171,14 @@ def second_order(lin: LinearModel) -> SecondOrder:
     )
 
 
+def outputs_without_rounding(lin: LinearModel, C: Array | None = None) -> ranks.Noisy:
+    """Return C (ny, nx), or another matrix with the same rows, without its rounding errors."""
+    C = lin.C if C is None else C
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    units = ranks.divisors(np.linalg.norm(C / size, axis=1))
+    return ranks.without_rounding(ranks.Noisy(C, 4.0 * ranks.EPS * np.abs(C)), units, size)
+
+
 def at_rest(lin: LinearModel) -> LinearModel | None:
     """Return the continuous model of `lin`, or `lin` itself if no continuous model is known.
 
@@ -194,6 +202,19 @@ def rates_of_positions(X: Array) -> Array:
     nv = len(X) // 2
     N = X[:nv, nv:]
     return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
+
+
+def energy_units(M: Array, N: Array) -> tuple[Array, Array]:
+    """Return the matrices (nx, nx) between states x = to_x xi and states xi in units of energy.
+
+    Velocities nu become L^T nu with M = L L^T, so the squared length of L^T nu is twice the kinetic
+    energy. Positions p with dp/dt = N nu become L^T N^-1 p. The second result is the inverse.
+    """
+    L, zero = np.linalg.cholesky(M), np.zeros_like(M)
+    to_velocity = np.linalg.inv(L.T)
+    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
+    from_x = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
+    return to_x, from_x
 
 
 @dataclass(frozen=True)

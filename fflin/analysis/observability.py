@@ -4,12 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.analysis import mechanics
+from fflin.analysis import along_motion, mechanics, moving_points
 from fflin.analysis.hautus import split_by_poles, unobservable
-from fflin.analysis.ranks import EPS, Noisy, RankAnalysis, divisors, echelon, without_rounding
-from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, instance, positive
+from fflin.analysis.ranks import (
+    FROZEN,
+    GRAMIAN,
+    FixedPoles,
+    Margin,
+    RankAnalysis,
+    echelon,
+    verdict,
+)
+from fflin.base.errors import InputError, listed
+from fflin.base.validation import Array, FrozenArrays, Values, instance, positive
 from fflin.dynamics.integrators import held_cost
+from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
 # Smallest decay rate that counts as nonzero, as a fraction of the largest modulus of a pole. A
@@ -26,6 +35,11 @@ class Observability(RankAnalysis):
     ----------
     dimension : int
         Number of states nx minus the dimension of the unobservable subspace.
+    bound : int
+        Largest possible dimension along the motion. It equals `dimension`, unless `method` is
+        "frozen".
+    duration : float
+        Duration [s] of the analysed trajectory; 0 for the model of one operating point.
     unobservable : tuple of str
         Names of the unobservable motions; each is a state or a combination of states.
     basis : ndarray (nx, nx - dimension)
@@ -35,11 +49,14 @@ class Observability(RankAnalysis):
         ``rows @ x = 0``.
     fixed_poles : ndarray (nx - dimension,)
         Poles of the estimation error that no observer can move: [1/s] for a continuous model,
-        discrete-time poles z for a sampled one.
-    detectable : bool
-        Whether all fixed poles are stable.
+        discrete-time poles z for a sampled one. Empty for a trajectory, which has no poles.
+    detectable : bool or None
+        Whether all fixed poles are stable. At a point that the robot leaves, and along a
+        trajectory: True if the outputs determine all states, False if they do not depend on the
+        position of the base, and None if this is undecided.
     method : str
-        Method that determined the dimension: "closed form" or "eigenvalues".
+        Method that determined the dimension: "closed form", "eigenvalues", "frozen" or "Gramian",
+        as in `Controllability`.
     margin : Margin
         Certainty of the rank decisions, as in `Controllability`.
     notes : tuple of str
@@ -53,30 +70,39 @@ class Observability(RankAnalysis):
     """
 
     unobservable: tuple[str, ...]
-    detectable: bool
+    detectable: bool | None
 
     def __str__(self) -> str:
         lines = [f"unobservable: {', '.join(self.unobservable)}"] if self.unobservable else []
-        decays = f"{'' if self.detectable else 'not '}detectable"
-        return self._summary("observable", decays, lines)
+        parts = ("position", "velocity", "attitude")[: (len(self.basis) - self.bound) // 3]
+        limit = f"no output depends on the {listed(parts)} of the base"
+        return self._summary("observable", limit, verdict(self.detectable, "detectable"), lines)
 
 
-def observability(lin: LinearModel) -> Observability:
+def observability(lin: LinearModel | LinearTrajectory) -> Observability:
     r"""Determine the observable subspace from C and the structure of A.
 
     At rest, observability is tested in second-order form, :math:`M a + D v + K s = 0` with damping
     D and stiffness K, by the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p.
     Here :math:`C_s` and :math:`C_v` are the columns of C for the positions s and the velocities v.
-    All poles at p = 0 are tested together. At nonzero velocity, observability is tested as the
+    All poles at p = 0 are tested together. In a steady motion, observability is tested as the
     controllability of the dual pair :math:`(A^T, C^T)`, with states scaled to units of energy, as
     in `controllability`. The unobservable subspace is the orthogonal complement of the controllable
     subspace of the dual pair.
 
+    At any other point, A and C change along the motion. The dynamics do not depend on the position,
+    velocity and attitude of the base, so these are unobservable, in motion as at rest, if the
+    outputs do not depend on them. If the outputs determine all positions at once, all states are
+    observable. Otherwise the rest is tested with A and C frozen at the operating point, and the
+    result is never detectable. Along a trajectory, the rank of the finite-horizon observability
+    Gramian is found, with the outputs at the knots. The result describes the errors at the first
+    knot that the outputs determine.
+
     Parameters
     ----------
-    lin : LinearModel
+    lin : LinearModel or LinearTrajectory
         Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
-        accepted.
+        accepted. A `LinearTrajectory` is analysed over its whole duration.
 
     Returns
     -------
@@ -86,7 +112,8 @@ def observability(lin: LinearModel) -> Observability:
     Raises
     ------
     InputError
-        If `lin` is not a `LinearModel`, or its states are not positions followed by their rates.
+        If `lin` is not a `LinearModel` or `LinearTrajectory`, or its states are not positions
+        followed by their rates.
 
     Examples
     --------
@@ -95,15 +122,18 @@ def observability(lin: LinearModel) -> Observability:
     >>> found.dimension, found.detectable
     (6, False)
     """
+    if isinstance(lin, LinearTrajectory):
+        return _along(lin)
     lin = mechanics.checked(lin)
-    size, nv = np.tile(np.sqrt(lin.M.diagonal()), 2), len(lin.M)
+    if not lin.is_equilibrium():
+        return _in_motion(lin)
+    nv = len(lin.M)
     source, method, motions = mechanics.at_rest(lin), "eigenvalues", None
     if source is not None:
         system = mechanics.second_order(source)
         N = mechanics.rates_of_positions(mechanics.rate_matrix(source))
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
-        units = divisors(np.linalg.norm(C / size, axis=1))
-        shown = without_rounding(Noisy(C, 4.0 * EPS * np.abs(C)), units, size)
+        shown = mechanics.outputs_without_rounding(lin, C)
         position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
         if found := unobservable(system, position, velocity, lin.dt):
             motions, _, fixed = found
@@ -113,21 +143,116 @@ def observability(lin: LinearModel) -> Observability:
         # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
         X = mechanics.rate_matrix(lin)
         _, motions, _, fixed = split_by_poles(X, lin.C.T, lin.M, lin.dt, dual=True)
+    dimension = len(lin.A) - motions.shape[1]
+    return _result(
+        lin,
+        motions,
+        bound=dimension,
+        fixed_poles=fixed.poles,
+        detectable=fixed.decays,
+        method=method,
+        margin=fixed.margin,
+        notes=(
+            *moving_points.steadiness(lin),
+            *mechanics.undecided(lin, fixed, "observable", dimension, "detectable"),
+        ),
+    )
+
+
+def _in_motion(lin: LinearModel) -> Observability:
+    """Determine the observable subspace at a point that is not an equilibrium.
+
+    The motions that symmetries make unobservable are exact. Unless the outputs determine all
+    states at once, the rest is decided by A and C at this point, as in `controllability`.
+    """
+    nx = len(lin.A)
+    notes = moving_points.steadiness(lin)
+    margin = moving_points.all_coordinates_measured(lin)
+    if margin is not None:
+        return _result(
+            lin,
+            np.zeros((nx, 0)),
+            bound=nx,
+            fixed_poles=np.zeros(0),
+            detectable=True,
+            method="closed form",
+            margin=margin,
+            notes=(moving_points.NOTE_AT_ONCE, *notes),
+        )
+    known = moving_points.unobserved(lin)
+    X = mechanics.rate_matrix(lin)
+    _, others, _, fixed = split_by_poles(X, lin.C.T, lin.M, lin.dt, known=known.T, dual=True)
+    motions = np.hstack((known, others))
+    fixed = fixed._replace(settling=Margin())  # the frozen poles do not decide about decay
+    undecided = mechanics.undecided(lin, fixed, "observable", nx - motions.shape[1])
+    return _result(
+        lin,
+        motions,
+        bound=nx - known.shape[1],
+        fixed_poles=np.concatenate(
+            (moving_points.constant_poles(known.shape[1], lin.dt), fixed.poles)
+        ),
+        detectable=False if known.shape[1] else None,
+        method=FROZEN,
+        margin=fixed.margin,
+        notes=(moving_points.NOTE, *notes, *undecided),
+    )
+
+
+def _along(traj: LinearTrajectory) -> Observability:
+    """Determine which errors at the start of a trajectory its outputs determine."""
+    first, _ = along_motion.ends(traj)
+    known = moving_points.unobserved(first, np.abs(traj.C).max(axis=0))
+    split = along_motion.seen(traj, known)
+    motions = np.hstack((known, split.to_x @ split.rest))
+    nx = len(motions)
+    dimension = nx - motions.shape[1]
+    fixed = FixedPoles(margin=split.margin)
+    detectable = None if motions.shape[1] else True
+    return _result(
+        first,
+        motions,
+        bound=dimension,
+        duration=float(traj.t[-1] - traj.t[0]),
+        fixed_poles=np.zeros(0),
+        detectable=False if known.shape[1] else detectable,
+        method=GRAMIAN,
+        margin=split.margin,
+        notes=mechanics.undecided(first, fixed, "observable", dimension),
+    )
+
+
+def _result(
+    lin: LinearModel,
+    motions: Array,
+    *,
+    bound: int,
+    fixed_poles: Values,
+    detectable: bool | None,
+    method: str,
+    margin: Margin,
+    notes: tuple[str, ...],
+    duration: float = 0.0,
+) -> Observability:
+    """Return the result for the unobservable motions (nx, k)."""
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
     basis, _ = echelon(motions, size)
     nx, count = basis.shape
     complement = np.linalg.qr(basis * size[:, None], mode="complete")[0][:, count:]
     return Observability(
         dimension=nx - count,
+        bound=bound,
+        duration=duration,
         unobservable=tuple(
             mechanics.combination(column, lin.state_names, size) for column in basis.T
         ),
         basis=basis,
         rows=complement.T * size,
-        fixed_poles=fixed.poles,
-        detectable=fixed.decays,
+        fixed_poles=fixed_poles,
+        detectable=detectable,
         method=method,
-        margin=fixed.margin,
-        notes=mechanics.undecided(lin, fixed, "observable", nx - count, "detectable"),
+        margin=margin,
+        notes=notes,
         robot=lin.robot,
     )
 

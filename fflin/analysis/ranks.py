@@ -12,6 +12,9 @@ from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
+# Values of `RankAnalysis.method` at a point that the robot leaves, and along a trajectory.
+FROZEN, GRAMIAN = "frozen", "Gramian"
+
 # Entries of an echelon form below this count as rounding errors. The pivots are 1, and the rows are
 # weighted to be comparable.
 _CLEAN = 1e-10
@@ -92,6 +95,8 @@ class RankAnalysis(FrozenArrays):
     """Common fields of `Controllability` and `Observability`, described in their docstrings."""
 
     dimension: int
+    bound: int
+    duration: float
     rows: Array
     basis: Array
     fixed_poles: Values
@@ -100,11 +105,35 @@ class RankAnalysis(FrozenArrays):
     notes: tuple[str, ...]
     robot: str
 
-    def _summary(self, what: str, decays: str, lines: list[str]) -> str:
-        """Return the report: the dimension, then `lines`, then the notes."""
-        head = f"{self.robot}: {self.dimension} of {len(self.basis)} states are {what} "
+    def _summary(self, what: str, limit: str, decays: str, lines: list[str]) -> str:
+        """Return the report: the dimension, then `lines`, then the notes.
+
+        `limit` is the reason why `bound` is less than the number of states.
+        """
+        nx = len(self.basis)
+        head = f"{self.robot}: {self.dimension} of {nx} states are {what} ({self.method})"
+        frozen = "the matrices frozen at this point, which the robot leaves"
+        if self.method == GRAMIAN:
+            head = (
+                f"{self.robot}: {self.dimension} of {nx} states are {what} along the motion of "
+                f"{self.duration:g} s ({self.method})"
+            )
+        elif self.method == FROZEN and self.bound < nx:
+            head = (
+                f"{self.robot}: at most {self.bound} of {nx} states are {what}, because {limit}; "
+                f"{self.dimension} of these {self.bound} by {frozen}"
+            )
+        elif self.method == FROZEN:
+            head = f"{self.robot}: {self.dimension} of {nx} states are {what} by {frozen}"
         notes = (f"note: {note}" for note in self.notes)
-        return folded([f"{head}({self.method}); {decays}", *lines, *notes])
+        return folded([f"{head}; {decays}", *lines, *notes])
+
+
+def verdict(decided: bool | None, adjective: str) -> str:
+    """Return an adjective that ends in "-able", negated or undecided if `decided` says so."""
+    if decided is None:
+        return f"{adjective.removesuffix('able')}ability is undecided"
+    return adjective if decided else f"not {adjective}"
 
 
 class Noisy(NamedTuple):

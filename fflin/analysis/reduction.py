@@ -8,9 +8,9 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis import mechanics
+from fflin.analysis import mechanics, moving_points
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
-from fflin.base.errors import InputError, StabilizabilityError
+from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
@@ -120,8 +120,13 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     Raises
     ------
     InputError
-        If the state derivative f0 at the operating point is nonzero in a direction that the
-        reduction removes, or `lin` is not a linear model.
+        If one of these conditions is true:
+
+        - a momentum is conserved, but the robot moves at the operating point, so that the momentum
+          is not the rate of a coordinate;
+        - the state derivative f0 at the operating point is nonzero in a direction that the
+          reduction removes;
+        - `lin` is not a linear model.
     ModelError
         If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
@@ -141,6 +146,7 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     wheels = removed_wheels(whole, wheel_speeds)
     lin = without(whole, wheels) if len(wheels) else whole
     momenta = mechanics.conserved(lin)
+    _require_coordinates(lin, momenta)
     z, T = momenta.selected, momenta.T
     judged = [name not in lin.ignorable for name in lin.state_names]
     drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
@@ -162,6 +168,24 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         ),
     )
     return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
+
+
+def _require_coordinates(lin: LinearModel, momenta: mechanics.ConservedMomenta) -> None:
+    """Raise `InputError` if a momentum is conserved but is not the rate of a coordinate.
+
+    This is so if the base rotates or the joints move. The angular momentum then depends on the
+    attitude, so it cannot be removed together with a coordinate.
+    """
+    if not lin.v.any() or len(momenta.weights) >= 6:
+        return
+    names = tuple(name for name in moving_points.conserved(lin).names if "momentum" in name)
+    if len(names) > len(momenta.weights):
+        raise InputError(
+            f"no input can change {listed(mechanics.grouped(names))}, but the robot moves at the "
+            "operating point, where momenta are not the rates of coordinates and cannot be removed "
+            "with them; linearise at rest (v = 0), or analyse the motion with "
+            "fflin.controllability"
+        )
 
 
 def generalized_inertia(lin: LinearModel) -> Array:

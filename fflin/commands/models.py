@@ -270,17 +270,28 @@ def analyze(arguments: Namespace) -> Report:
     _, lin = linear_model(arguments)
     moved, shown, found = fflin.controllability(lin), fflin.observability(lin), fflin.modes(lin)
     parts = {"inputs": moved, "momentum": _momentum(lin), "modes": found, "outputs": shown}
-    nx = len(lin.A)
-    head = [
-        "controllable" if moved.dimension == nx else f"not controllable ({moved.dimension}/{nx})",
-        "observable" if shown.dimension == nx else f"not observable ({shown.dimension}/{nx})",
-        counted(len(found.unstable), "unstable pole"),
-    ]
+    poles = counted(len(found.unstable), "unstable pole")
+    if not found.equilibrium:
+        poles += " of the frozen A"  # away from an equilibrium, poles do not decide stability
+    head = [_rank(moved, "controllable"), _rank(shown, "observable"), poles]
     sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
     result = {"controllability": moved, "observability": shown, "modes": found}
     text = "\n\n".join([", ".join(head), *sections])
     files = {arguments.plot: lambda path: fflin.plot_modes(found, path)}
     return Report(lin.robot, result, text, files)
+
+
+def _rank(found: fflin.Controllability | fflin.Observability, adjective: str) -> str:
+    """Return whether all states are controllable, or observable, for the headline."""
+    from fflin.analysis.ranks import FROZEN
+
+    nx = len(found.basis)
+    if found.bound < nx:
+        most = "at most " if found.method == FROZEN else ""
+        return f"not {adjective} ({most}{found.bound}/{nx})"
+    if found.method == FROZEN:
+        return f"{found.dimension}/{nx} {adjective} by frozen matrices"
+    return adjective
 
 
 def modes(arguments: Namespace) -> Report:
@@ -366,7 +377,11 @@ def _momentum(lin: fflin.LinearModel) -> str:
             f"by the conserved momentum has {len(reduced.A)} states"
         )
     elif not lin.is_equilibrium():
-        text = "no momentum can be removed, because the operating point is not an equilibrium"
+        text = (
+            "no momentum can be removed: the operating point is not an equilibrium, and "
+            f"{'the orbit' if lin.mean_motion else 'inputs'} may change every component of the "
+            "momentum"
+        )
     else:
         orbit = "the orbit, " * bool(lin.mean_motion)
         text = (

@@ -247,10 +247,10 @@ def along(motion: Trajectory) -> LinearTrajectory:
     return made
 
 
-# _ACCURACY is the required relative accuracy of a sample's transition matrix. The integration steps
+# ACCURACY is the required relative accuracy of a sample's transition matrix. The integration steps
 # are halved until the matrix is accurate, or until each interval has _MOST_PARTS parts. The knots
 # within a sample divide the sample into intervals.
-_ACCURACY, _MOST_PARTS = 1e-8, 64
+ACCURACY, _MOST_PARTS = 1e-8, 64
 
 # Number of samples that are integrated together.
 _BATCH = 64
@@ -283,6 +283,16 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
         near = 1e-9 * (end - start)
         inner = traj.t[(traj.t > start + near) & (traj.t < end - near)]
         cuts.append(np.array([start, *inner, end]))
+    yield from _accurate(traj, cuts)
+
+
+def knot_transitions(traj: LinearTrajectory) -> Iterator[tuple[Steps, Array]]:
+    """Yield the integration steps and the transition matrix from each knot to the next."""
+    yield from _accurate(traj, [np.array(ends) for ends in pairwise(traj.t.tolist())])
+
+
+def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps, Array]]:
+    """Yield the steps and the transition matrix of each sample, for the samples of `_through`."""
     for first in range(0, len(cuts), _BATCH):
         batch = cuts[first : first + _BATCH]
         found, parts, pending = _through(traj, batch, 1), 1, list(range(len(batch)))
@@ -294,7 +304,7 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
                 # Halving the steps divides the error by 16, so the remaining error is about 1/15 of
                 # the change. For a safety margin, the estimate is 1/4 of the change.
                 apart = np.abs(each[1] - found[k][1]).max(axis=0)
-                if not (0.25 * apart <= _ACCURACY * np.abs(each[1]).max(axis=0)).all():
+                if not (0.25 * apart <= ACCURACY * np.abs(each[1]).max(axis=0)).all():
                     pending.append(k)
                 found[k] = each
         yield from found

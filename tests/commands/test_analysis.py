@@ -36,10 +36,18 @@ def test_in_orbit_its_field_acts_on_all_momenta():
     assert "orbit" not in run("analyze", "cubesat")[1]
 
 
-def test_points_off_rest_are_told():
+def test_points_off_rest_are_told(tmp_path):
     code, out, err = run("analyze", "ets_vii", "--velocity", "omega_b.z=0.1")
     assert code == 0 and not err
-    assert "not an equilibrium" in out and says(out, "A and B frozen")
+    assert says(out.splitlines()[0], "controllable, observable") and "not an equilibrium" in out
+    (tmp_path / "joints.toml").write_text(JOINTS)
+    moving = ("analyze", "ets_vii", "--inputs", "joints.toml", "--velocity", "joint_1=0.1")
+    code, out, err = run(*moving, cwd=tmp_path)
+    assert code == 0 and not err
+    assert says(out, "analyze: not controllable (at most 15/24)", "of the frozen A")
+    assert says(out, "at most 15 of 24", "frozen at this point", "not stabilizable")
+    assert says(out, "no reduction", "linearise at rest")
+    assert "stabilizable" not in " ".join(out.split()).replace("not stabilizable", "")
 
 
 def test_bad_input_is_one_line():
