@@ -126,6 +126,8 @@ class Campaign(FrozenArrays):
         Requested number of runs. N is smaller if the condition `until` ended the campaign early.
     goals : tuple of str
         Conditions whose success rates appear in the printed report and in `plot_campaign`.
+    notes : tuple of str
+        Remarks on the time step of the runs; see `Motion.notes`.
 
     Examples
     --------
@@ -170,6 +172,7 @@ class Campaign(FrozenArrays):
     engine: str
     goals: tuple[str, ...]
     confidence: float
+    notes: tuple[str, ...] = ()
     _job: CampaignJob | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
@@ -399,6 +402,8 @@ class Campaign(FrozenArrays):
         values = dict[str, Any]()
         for key in ARRAYS:
             values[key] = arrays[key] if run.all() else arrays[key][run]
+        # Files of earlier versions have no notes.
+        header = {"notes": [], **header}
         for key in _HEADER:
             value = header[key]
             values[key] = tuple(value) if isinstance(value, list) else value

@@ -320,6 +320,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "urdf_sha256": robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,
         "dt": plan.times.dt,
+        "notes": list(plan.times.notes),
         "engine": job.engine,
         "times": (job.steps * plan.times.dt).tolist(),
         "input_limits": np.fmax(-plan.limits.low, plan.limits.high).tolist(),

@@ -22,6 +22,7 @@ def campaign_report(campaign: Campaign) -> str:
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
+    title += f" in steps of {campaign.dt:.3g} s"
     rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
     for name, unit in KINDS.items():
         figures = [quantile(name, p).value for p in _SHARES]
@@ -36,7 +37,8 @@ def campaign_report(campaign: Campaign) -> str:
         f"rank correlations with {', '.join(names)}: {first}" for first, names in causes.items()
     ]
     goals = [goal_met(campaign, goal) for goal in campaign.goals]
-    head = folded([*goals, ended_of(campaign), f"{title}, seed {campaign.seed}{by}"])
+    ended = ended_of(campaign)
+    head = folded([*goals, ended, f"{title}, seed {campaign.seed}{by}", *campaign.notes])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
 
 
@@ -106,6 +108,7 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
     names = [f"{of}{kind}" for kind in KINDS for of in ("", "worst ", "settle ")]
     sure = {"confidence": campaign.confidence}
     header = ("robot", "urdf_sha256", "asked", "duration", "dt", "seed", "engine", "confidence")
+    header += ("notes",)
     return {
         **{key: getattr(campaign, key) for key in header},
         "runs": len(campaign),

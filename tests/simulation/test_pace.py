@@ -281,6 +281,7 @@ def test_campaigns_use_the_same_step():
     motion = fflin.simulate(robot, policy, duration=0.5)
     runs = fflin.monte_carlo(robot, policy, {"q_b": 0.01}, runs=2, duration=0.5, engine="python")
     assert runs.dt == motion.t[1] < 0.01
+    assert runs.notes == motion.notes and "array_mode_1" in str(runs)
 
 
 def test_the_pace_of_a_rotation_is_that_of_an_undamped_mode():
