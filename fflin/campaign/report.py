@@ -107,7 +107,17 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
 
     names = [f"{of}{kind}" for kind in KINDS for of in ("", "worst ", "settle ")]
     sure = {"confidence": campaign.confidence}
-    header = "robot urdf_sha256 asked duration dt notes seed engine confidence".split()
+    header = [
+        "robot",
+        "urdf_sha256",
+        "asked",
+        "duration",
+        "dt",
+        "notes",
+        "seed",
+        "engine",
+        "confidence",
+    ]
     return {
         **{key: getattr(campaign, key) for key in header},
         "runs": len(campaign),
