@@ -136,7 +136,7 @@ class Validity(FrozenArrays):
 
 
 _ENDS = {
-    "slow": "were still settling",
+    "slow": "did not settle in the allowed time",
     "chart": "approached a rotation of 180 deg",
     "diverged": "diverged",
 }

@@ -230,8 +230,9 @@ class ReactionWheel(Input):
         Upper and lower limits [N m] of the motor's torque. These and all following parameters are
         keyword only.
     max_speed : float, optional
-        Largest speed [rad/s] of the wheel relative to the carrier, in both directions. Give
-        `max_speed` only for a wheel with inertia J, which then stores at most J max_speed [N m s].
+        Largest speed [rad/s] relative to the carrier to which the motor accelerates the wheel, in
+        both directions. Other inputs that rotate the carrier can drive the wheel beyond this speed.
+        Give `max_speed` only for a wheel with inertia J, which then stores J max_speed [N m s].
 
     Examples
     --------

@@ -269,7 +269,8 @@ def pushed(of: object) -> bool:
 def motion_report(motion: Motion) -> str:
     """Return a text about settling, inputs, limit violations and conserved quantities."""
     kinds, t = error_sizes(motion), motion.t
-    head = [verdict(motion, kinds)] if kinds or motion.stopped else []
+    heads = [verdict(motion, kinds) if kinds or motion.stopped else "", _fast_wheels(motion)]
+    head = ["; ".join(filter(None, heads))] if any(heads) else []
     by = ", compiled" if motion.engine == "compiled" else ""
     steps = f" in steps of {motion.step:.3g} s" if motion.step else ""
     head.append(f"{motion.robot}: {t[-1]:g} s{steps}, {len(t)} rows, frame {motion.frame}{by}")
@@ -393,6 +394,18 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
     more = [f"{len(full) - _NAMED} more"] if len(full) > _NAMED else []
     return f"{said}; saturated inputs: {', '.join(full[:_NAMED] + more) or 'none'}"
+
+
+def _fast_wheels(motion: Motion) -> str:
+    """Return a line about the wheels that exceed their largest speeds, or an empty text."""
+    speeds = {f"qdot_m.{name}" for name in motion.wheels}
+    fast = [
+        f"{_name(each.name)}\u00a0{_shown(each.value)}\u00a0{each.unit} "
+        f"(limit\u00a0{_shown(each.limit)})"
+        for each in motion.passed
+        if each.name in speeds
+    ]
+    return f"wheel speed limit exceeded: {_and(fast)}" if fast else ""
 
 
 def _and(words: list[str]) -> str:

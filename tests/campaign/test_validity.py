@@ -158,6 +158,29 @@ def test_same_seed_same_result_whoever_runs_it(robots):
     assert (other.prediction_error != one.prediction_error).any()
 
 
+def test_a_run_that_ends_unsettled_may_settle_later_or_never():
+    """Its error may grow, so that nothing is said of what it would do after the allowed time."""
+    reach = {"attitude": 9.0, "position": 0.1, "joint": 0.0}
+    found = fflin.Validity(
+        levels=np.ones(1),
+        prediction_error=np.zeros(1),
+        slope=2.0,
+        trusted=reach,
+        sampled=np.linspace(0.1, 1.0, 4),
+        outcomes=("settled", "slow", "diverged", "slow"),
+        holds=reach,
+        inside=1,
+        inside_rate=0.05,
+        rate=(0.01, 0.8),
+        confidence=0.95,
+        largest=reach,
+        joint_unit="rad",
+        robot="cubesat",
+        frame="hybrid",
+    )
+    assert "; 2 did not settle in the allowed time, 1 diverged" in " ".join(str(found).split())
+
+
 @pytest.mark.compiled
 def test_what_the_counts_say(robots):
     """A loop that is lost far out: the runs below the first failure, and both intervals."""

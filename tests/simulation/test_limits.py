@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,29 @@ def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
     assert told["spin"].share == pytest.approx(full.mean(), abs=1e-3)
     assert told["qdot_m.spin"].share == pytest.approx(1.0 - full.mean(), abs=2e-3)
     assert not motion.passed
+
+
+@pytest.mark.parametrize("torque", [0.0, 8.0])
+def test_a_wheel_that_other_inputs_drive_beyond_its_limit_is_in_the_headline(torque):
+    """The motor does not brake the wheel, so the body turns under it."""
+    wheel = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=INERTIA, max_speed=2.0, max=0.5)
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[fflin.BaseTorque(), wheel])
+    v0 = fflin.velocity(robot, {"spin": 1.9})
+
+    def push(t, q, v):
+        return [0.0, 0.0, -torque, 0.0]
+
+    run = {"v0": v0, "duration": 10.0, "dt": 0.1, "limits": "urdf"}
+    free = fflin.simulate(robot, push, **run)
+    motion = fflin.simulate(robot, push, target=fflin.linearize(robot).x0, **run)
+    speed = motion.x[:, motion.state_names.index("qdot_m.spin")]
+    # The wheel keeps its own rate, while the body turns the other way.
+    body = torque / (40.0 - INERTIA) * motion.t
+    np.testing.assert_allclose(speed, 1.9 + body, rtol=1e-9)
+    exceeded = f"wheel speed limit exceeded: spin {speed[-1]:.3g} rad/s (limit 2)"
+    for each in (motion, free, replace(motion, stopped="by hand")):
+        headline = " ".join(str(each).partition("\nbody: ")[0].split())
+        assert (exceeded in headline) == (torque > 0.0) == ("speed limit" in headline)
 
 
 def test_the_attitude_is_lost_where_the_wheel_is_full():
