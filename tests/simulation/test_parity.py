@@ -397,11 +397,14 @@ def test_each_public_regulator_warns_and_designs_that_contain_one_do_not():
     assert not in_python(lambda: fflin.mpc(lin, weights=weights, **within))
 
 
-def test_a_joint_is_warned_of_only_beyond_its_limits():
-    robot = fflin.load("servicer_7dof")
-    low, high = robot.model.lowerPositionLimit[8], robot.model.upperPositionLimit[8]
-    within = {"joint_2": high}
-    assert in_python(lambda: fflin.configuration(robot, within)) == set()
-    for value in (low - 1e-3, high + 1e-3):
-        [text] = in_python(lambda value=value: fflin.configuration(robot, {"joint_2": value}))
-        assert "is outside" in text
+def test_a_joint_is_warned_of_only_beyond_its_limits(tmp_path):
+    file = tmp_path / "hinge.urdf"
+    limited = WHEEL.replace("continuous", "revolute").replace(
+        "<axis", '<limit lower="-0.5" upper="1" effort="1" velocity="1"/><axis'
+    )
+    file.write_text(URDF.format(m=20, x=2.0, y=3.0, z=2.5, more=limited))
+    robot = fflin.load(file)
+    for value, beyond in ((-0.5, False), (1.0, False), (-0.6, True), (1.1, True)):
+        found = in_python(lambda value=value: fflin.configuration(robot, {"spin": value}))
+        said = {f"joint 'spin' at {value:g} rad is outside -0.5 to 1 rad"}
+        assert found == (said if beyond else set())
