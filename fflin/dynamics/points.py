@@ -1,6 +1,5 @@
 """Configurations, velocities and inputs, built from values that are given by name."""
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -81,10 +80,6 @@ def _warn_beyond_travel(robot: Robot, joint: Joint, value: float) -> None:
         return
     unit = joint.unit
     text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
-    radians = math.radians(value)
-    # A larger angle is more than a full turn, so it was probably meant in degrees.
-    if unit == "rad" and abs(value) > 2.0 * math.pi and low <= radians <= high:
-        text += f"; angles are in rad, and {value:g} deg are {radians:.4g} rad"
     warnings.warn(text, FflinWarning, stacklevel=3)
 
 

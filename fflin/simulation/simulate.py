@@ -244,15 +244,18 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
-    beyond = past_half_turn(plan, run)
+    reference = conjugate(state.origin_quaternion)
+    if plan.follows is not None:
+        q, v, _ = map(np.array, zip(*map(plan.follows, run.t.tolist()), strict=True))
+        reference = q[:, 3:7]
+        if plan.reference is not None:
+            target = state_history(state, q, v, plan.near, run.t)
+    beyond = past_half_turn(run, reference)
     # Beyond 180 deg from the reference, q_b jumps to the shorter rotation. A linear model does not
     # predict this jump.
     prediction = x[:0]
     if foresees is not None and beyond is None:
         prediction = predict(plan, foresees, x, run.steps)
-    if plan.reference is not None:
-        q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
-        target = state_history(state, q, v, plan.near, run.t)
     energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
     bound = plan.law and plan.law.policy
     limits = limits_of(plan.options.robot) | plan.acting
@@ -321,19 +324,17 @@ def _gained(plan: Plan, run: Recording, energy: Array, scale: float) -> Iterator
         )
 
 
-def past_half_turn(plan: Plan, run: Recording) -> float | None:
+def past_half_turn(run: Recording, reference: Array) -> float | None:
     """Return the time [s] of the first recorded row after the base rotated past 180 deg, or None.
 
-    The rotation is relative to the reference of q_b. For a policy that follows a trajectory, the
-    rotation is relative to the attitude of the trajectory.
+    `reference` is the attitude from which the rotation is measured: one quaternion (4,), or one
+    quaternion for each row (N, 4), of arbitrary signs.
     """
-    if plan.follows is None:
-        reference = conjugate(plan.plant.state.origin_quaternion)
-    else:
-        reference = np.array([plan.follows(t)[0][3:7] for t in run.t.tolist()])
+    if reference.ndim == 2:
         # Of the two quaternions of each attitude, choose the one that is nearer to the row before.
         products = (reference[1:] * reference[:-1]).sum(axis=1)
-        reference[1:] *= np.cumprod(np.where(products < 0.0, -1.0, 1.0))[:, None]
+        signs = np.cumprod(np.where(products < 0.0, -1.0, 1.0))
+        reference = reference * np.append(1.0, signs)[:, None]
     # The scalar part of the quaternion from the reference to the base changes its sign at 180 deg.
     negative = (run.q[:, 3:7] * reference).sum(axis=1) < 0.0
     rows = np.flatnonzero(negative != negative[0])
@@ -348,9 +349,11 @@ def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> lis
     if beyond is None:
         return []
     clauses = list[str]()
-    known = plan.follows is not None or axes_of(plan.policy)[1] is not None
-    steered = not plan.steered or "q_b" in map(group_of, plan.steered)
-    if plan.policy is not None and known and steered:
+    steered = "q_b" in map(group_of, plan.steered)
+    if not plan.steered and feedback_of(plan.policy)[0] is None:
+        # C code does not say which states it feeds back. A function has no reference.
+        steered = axes_of(plan.policy)[1] is not None
+    if steered:
         clauses.append("the law continued with the shorter rotation")
     if predicted:
         clauses.append("the linear prediction is omitted, because it does not hold there")

@@ -62,7 +62,7 @@ def test_many_inputs_and_few(robots):
 
 def test_at_rest_none_is_left_to_the_solver_of_one(robots, monkeypatch):
     """All poles of the servicer, light joints beside a heavy base, and weights apart by 1e8."""
-    monkeypatch.setattr("fflin.batch.gains.lqr", None)
+    monkeypatch.setattr("fflin.batch.gains.regulator", None)
     for name in BUNDLED:
         batch = fflin.sweep(robots[name], points(robots[name], 8)[0])
         for R in (1.0, 1e4, 1e-4):

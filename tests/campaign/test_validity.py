@@ -115,6 +115,20 @@ def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, ou
     assert OUTCOMES[int(found["outcome"][0])] == outcome
 
 
+@pytest.mark.parametrize("predicts", [True, False])
+def test_a_comparison_with_the_linear_loop_ends_at_half_a_turn(robots, predicts):
+    """Although the same law continues there in a simulation."""
+    lin, gain = held(robots["cubesat"])
+    loop = Loop(robots["cubesat"], lin, gain.K)
+    x = lin.x0.copy()
+    x[0], x[6] = np.sin(np.radians(85.0)), 2.0  # half of 170 deg, and a rate [rad/s] away from 0
+    job = loop.runs(predicts, None, 0.0, "python")
+    stopped = go(job.plan_of(x - lin.x0)).stopped
+    assert stopped.startswith("left the chart at t = ")
+    policy = fflin.StateFeedback(lin, gain.K)
+    assert not fflin.simulate(robots["cubesat"], policy, x0=x, duration=1.0).stopped
+
+
 def test_displacements_are_as_large_as_they_say(robots):
     robot = robots["ets_vii"]
     lin, gain = held(robot)

@@ -130,6 +130,8 @@ def test_turn_of_exactly_pi_is_refused_with_what_happens():
     assert fflin.check(robot, fflin.linearize(robot, q)).ok
     with pytest.raises(fflin.ChartError):
         fflin.linearize(robot, q, reference=pin.SE3.Identity())
+    with pytest.raises(fflin.ChartError):
+        fflin.simulate(robot, target=fflin.linearize(robot, q), duration=1.0)
 
 
 def test_sign_of_the_quaternion_does_not_matter():
