@@ -18,12 +18,17 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
+from fflin.robot.mass_properties import mode_carriers
 from fflin.robot.robot import Robot
 
 # With coordinates scaled to unit inertias, a stiffness counts as zero if it is at most nx times
 # this fraction of the largest stiffness. Modes below about 3e-7 sqrt(nx) times the highest
 # frequency therefore count as rigid-body modes.
 _NO_STIFFNESS = 1e-13
+
+# The energy of a body is a sum, in which large terms of balls and of their link may cancel. The
+# energy counts as zero up to this fraction of the terms.
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,8 @@ class Mode(FrozenArrays):
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
-        "base". The mapping is empty if the model was loaded from a file.
+        "base". A body includes its flexible appendages and sloshing liquid. The mapping is empty if
+        the model was loaded from a file.
 
     Notes
     -----
@@ -55,6 +61,10 @@ class Mode(FrozenArrays):
 
     .. math::
         e_i = \frac{V_i^H I_i V_i}{\sum_k V_k^H I_k V_k}.
+
+    For a body with flexible appendages or slosh, the term of the body also contains the energy of
+    its modes, see (16.1) of docs/derivation.md. For a joint with a rotor inertia, it contains the
+    energy of the rotor.
 
     The twists are relative to the reference frame. If the robot floats freely at rest, its modes
     have zero momentum, so the fractions do not depend on which link is the base. The fraction
@@ -371,25 +381,40 @@ def energies_of(
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     chart, data = state.chart(lin.q), robot.create_data()
     names = ("base", *list(robot.model.names)[ROOT + 1 :])
-    inertias = robot.model.inertias.tolist()[ROOT:]
     moved = shape[: len(shape) // 2]
     if isinstance(lin, ReducedModel):
         moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
     # The kinetic energy is computed with displacements, in base axes, instead of velocities. In a
     # mode, the velocities are the displacements times the pole, so the fractions are the same.
     moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
-    kinetic = np.zeros(len(names))
-    for part in (moved.real, moved.imag):
-        pin.forwardKinematics(robot.model, data, lin.q, state.spread(part))
-        twists = data.v.tolist()[ROOT:]
-        kinetic += [body.vtiv(V) for body, V in zip(inertias, twists, strict=True)]
+    terms = sum(_energies(robot, data, lin.q, state.spread(x)) for x in (moved.real, moved.imag))
+    # The inertia of a link without its balls is not physically realisable, and its energy alone may
+    # be negative. So the energies of all balls and liquids are added to the energy of their link.
+    carriers = mode_carriers(robot)
+    owners = np.array([carriers.get(i, i) for i in range(ROOT, robot.model.njoints)]) - ROOT
+    kinetic, sizes = np.zeros(len(names)), np.zeros(len(names))
+    np.add.at(kinetic, owners, terms)
+    np.add.at(sizes, owners, np.abs(terms))
+    kinetic[np.abs(kinetic) <= _ROUNDING * sizes] = 0.0
     kinetic /= kinetic.sum() or 1.0
     order = np.argsort(-kinetic.round(9), kind="stable").tolist()
-    energy = {names[i]: float(kinetic[i]) for i in order}
+    energy = {names[i]: float(kinetic[i]) for i in order if i + ROOT not in carriers}
     elastic = robot.springs.stiffness * np.abs(moved[6:]) ** 2
     elastic /= elastic.sum() or 1.0
     order = np.argsort(-elastic, kind="stable").tolist()
     return energy, {robot.joint_names[i]: float(elastic[i]) for i in order if elastic[i] > 0.0}
+
+
+def _energies(robot: Robot, data: pin.Data, q: Array, v: Array) -> Array:
+    """Return twice the kinetic energy of each body, with the rotor of its joint, at q and v."""
+    model = robot.model
+    pin.forwardKinematics(model, data, q, v)
+    bodies = zip(model.inertias.tolist(), data.v.tolist(), strict=True)
+    energies = np.array([body.vtiv(V) for body, V in bodies])
+    for index in range(ROOT, model.njoints):
+        rates = slice(model.idx_vs[index], model.idx_vs[index] + model.nvs[index])
+        energies[index] += model.armature[rates] @ v[rates] ** 2
+    return energies[ROOT:]
 
 
 def nonzero_eigenpairs(

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import filterfalse
-from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -265,17 +264,98 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     return changes
 
 
+class _Part(NamedTuple):
+    """Body with the balls and liquids of its modes, and its motions with kinetic energy.
+
+    Each row of `rows` (r, 6 + k) is a velocity on which the kinetic energy depends, as a linear
+    function of the twist (6,) of the body and of the rates (k,) of its modes, in units of v. The
+    twist is in the axes of the body's joint, about the point `center` (3,). There are 6 + k rows
+    if every motion of the part has kinetic energy.
+    """
+
+    joint: int
+    center: Array
+    modes: list[int]  # indices of the modes in v
+    rows: Array
+
+
+def _rigid_part(model: pin.Model, index: int) -> _Part:
+    """Return the body of a joint, which carries no modes."""
+    body = model.inertias[index]
+    values, axes = np.linalg.eigh(body.inertia)
+    turning = axes[:, values > _NO_MOMENT * values[2]].T
+    moving = np.eye(3) if body.mass > 0.0 else np.zeros((0, 3))
+    rows = np.zeros((len(moving) + len(turning), 6))
+    rows[: len(moving), :3], rows[len(moving) :, 3:] = moving, turning
+    return _Part(index, body.lever, [], rows)
+
+
+def _have_inertia(model: pin.Model, indices: Sequence[int]) -> bool:
+    """Return whether all bodies of joints have a mass, and moments of inertia about all axes."""
+    bodies = [model.inertias[index] for index in indices]
+    values = np.linalg.eigvalsh(np.reshape([body.inertia for body in bodies], (-1, 3, 3)))
+    masses = np.array([body.mass for body in bodies])
+    return bool((masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all())
+
+
+def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) -> _Part:
+    """Return the body of a joint with the balls and liquids of its modes.
+
+    `mode_joints` maps the joints of these modes to their indices in v, in ascending order.
+    """
+    # The body without its balls may have negative moments of inertia, so only the sum is judged.
+    modes = [*mode_joints.values()]
+    placements = {body: pin.SE3.Identity()}
+    columns = {body: np.zeros((6, len(modes)))}
+    for at, index in enumerate(mode_joints):
+        parent, joint_data = model.parents[index], model.joints[index].createData()
+        model.joints[index].calc(joint_data, pin.neutral(model))
+        placements[index] = placements[parent] * model.jointPlacements[index]
+        columns[index] = columns[parent].copy()
+        columns[index][:, at] = placements[index].toActionMatrix() @ np.ravel(joint_data.S)
+    inertias = {index: at.act(model.inertias[index]) for index, at in placements.items()}
+    mass = sum(inertia.mass for inertia in inertias.values())
+    moment = sum(inertia.mass * inertia.lever for inertia in inertias.values())
+    center = moment / mass if mass > 0.0 else np.zeros(3)
+    to_center = pin.SE3(np.eye(3), -center)
+    M = np.diag([*[0.0] * 6, *model.armature[modes]])
+    for index, inertia in inertias.items():
+        V = np.hstack((np.eye(6), to_center.toActionMatrix() @ columns[index]))
+        M += V.T @ to_center.act(inertia).matrix() @ V
+    # Scale M to a matrix with entries of at most 1, so that its rounding errors are known.
+    sizes = M.diagonal().copy()
+    sizes[:3], sizes[3:6] = mass, np.linalg.eigvalsh(M[3:6, 3:6])[-1]
+    scale = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+    values, axes = np.linalg.eigh(M / np.outer(scale, scale))
+    rows = axes[:, values > _NO_MOMENT].T * scale / scale[0]
+    return _Part(body, center, modes, rows)
+
+
+def mode_carriers(robot: Robot) -> dict[int, int]:
+    """Return {joint of a mode: joint of the body that carries the mode}, in ascending order."""
+    found: dict[int, int] = {}
+    for index in sorted(robot.model.getJointId(joint.name) for joint in robot.modes):
+        parent = robot.model.parents[index]
+        found[index] = found.get(parent, parent)
+    return found
+
+
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     """Return the names of the coordinates that can move without kinetic energy; usually none."""
     # A motion has no kinetic energy if it moves no centre of mass, rotates no body about an axis
     # with inertia, and moves no joint with armature. The test uses only whether a mass or moment is
     # zero. If it computed the kinetic energy, rounding errors could hide such a motion.
-    bodies = robot.model.inertias.tolist()[ROOT:]
-    masses = np.array([*map(attrgetter("mass"), bodies)])
-    values, axes = np.linalg.eigh([*map(attrgetter("inertia"), bodies)])
-    if (masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all():
+    model = robot.model
+    modes_of: dict[int, dict[int, int]] = {}
+    for index, carrier in mode_carriers(robot).items():
+        modes_of.setdefault(carrier, {})[index] = model.joints[index].idx_v
+    flexible = [_flexible_part(model, *item) for item in modes_of.items()]
+    modes = {index for group in modes_of.values() for index in group}
+    rigid = [i for i in range(ROOT, model.njoints) if i not in modes and i not in modes_of]
+    complete = all(part.rows.shape[0] == part.rows.shape[1] for part in flexible)
+    if complete and _have_inertia(model, rigid):
         return ()
-    moments = [*zip(values, axes, strict=True)]
+    parts = [*(_rigid_part(model, index) for index in rigid), *flexible]
     # Mimic joints follow their leaders. Therefore v = columns @ nu, where nu is the velocity of the
     # base and of the independent joints.
     columns = np.eye(robot.nv)
@@ -285,15 +365,16 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     # If M is singular at two random configurations, it is almost surely singular at every
-    # configuration.
+    # configuration. Modal amplitudes are zero, because `rows` are valid only there.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
+        velocity[[joint.idx_v for joint in robot.modes]] = 0.0
         q = pin.integrate(robot.model, robot.neutral(), velocity)
-        moved = _moved(robot, q, moments) @ columns
+        moved = _moved(robot, q, parts) @ columns
         moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
-        _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
+        _, sizes, motions = np.linalg.svd(np.linalg.qr(moved, mode="r"))
         rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
-        involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
+        involved = np.linalg.norm(motions[rank:], axis=0) > _INVOLVED
         if not involved.any():
             return ()
     return tuple(dict.fromkeys(names[involved].tolist()))
@@ -307,9 +388,15 @@ def coordinate_names(robot: Robot) -> list[str]:
 def massless_note(robot: Robot) -> str:
     """Return the message about coordinates that can move without kinetic energy."""
     idle = listed(robot.idle_coordinates)
+    advice = "give an inertia to the link of each such joint, or lock the joint"
+    if {f"joint '{joint.name}'" for joint in robot.modes} & {*robot.idle_coordinates}:
+        advice = (
+            "the effective mass of modes is the whole mass of their link in some direction, so "
+            "give the link more inertia, or the modes less participation"
+        )
     return (
         f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
-        "without moving mass; give an inertia to the link of each such joint, or lock the joint"
+        f"without moving mass; {advice}"
     )
 
 
@@ -322,23 +409,22 @@ def require_inertia(robot: Robot) -> None:
         raise SingularInertiaError(massless_note(robot))
 
 
-def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
+def _moved(robot: Robot, q: Array, parts: Sequence[_Part]) -> Array:
     """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
 
-    These are the rates of joints with armature, the velocities of centres of mass, and the angular
-    velocities about principal axes with inertia. `moments` contains the eigenvalues and
-    eigenvectors of each inertia.
+    These are the rates of joints with armature and the rows of all parts. The modal amplitudes in
+    q must be zero.
     """
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)
-    rows = [np.eye(model.nv)[model.armature > 0.0]]
-    for index, (values, axes) in enumerate(moments, start=ROOT):
-        body = model.inertias[index]
-        J = pin.getJointJacobian(model, data, index, pin.ReferenceFrame.LOCAL)
-        if body.mass > 0.0:
-            rows.append(J[:3] - skew(body.lever) @ J[3:])
-        turning = values > _NO_MOMENT * values[2]
-        rows.append(axes[:, turning].T @ J[3:])
+    armature = model.armature > 0.0
+    armature[[joint.idx_v for joint in robot.modes]] = False  # included in `parts`
+    rows = [np.eye(model.nv)[armature]]
+    for part in parts:
+        J = pin.getJointJacobian(model, data, part.joint, pin.ReferenceFrame.LOCAL)
+        linear = J[:3] - skew(part.center) @ J[3:]
+        rates = np.eye(model.nv)[part.modes]
+        rows.append(part.rows @ np.vstack((linear, J[3:], rates)))
     return np.vstack(rows)
 
 

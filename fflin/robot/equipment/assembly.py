@@ -3,10 +3,12 @@ r"""Equipment of a robot: reaction wheels, flexible appendages and slosh, as joi
 Each mode of a flexible appendage is modelled by a ball on a screw joint, see (16.4) of
 docs/derivation.md. The ball is a rigid body with the spatial inertia ``I``. At unit modal rate, the
 ball has the twist ``S`` and the momentum ``I S``, which is the mode's column of the modal
-participation L (6, k). The modal mass is ``S^T I S`` = 1. If the link is too light for this ball, a
-lighter ball is used, whose ``S^T I S`` exceeds 1. A negative rotor inertia of the joint then
-reduces the modal mass to 1. The inertia of the ball is subtracted from the inertia of the link.
-Therefore, the link and its balls together have the inertia in the URDF.
+participation L (6, k). The modal mass is ``S^T I S`` = 1. Mass, inertia and position of the ball
+follow from the appendage alone, so the rest of the link does not affect the modal forces. If the
+link is too light for its balls, lighter balls are used, whose ``S^T I S`` exceeds 1. A negative
+rotor inertia of the joint then reduces the modal mass to 1. The inertia of the ball is subtracted
+from the inertia of the link. Therefore, the link and its balls together have the inertia in the
+URDF.
 """
 
 from __future__ import annotations
@@ -42,18 +44,24 @@ _NEGATIVE = 1e-9
 _AGREE = 1e-2
 # Largest total mass of the balls on a body, as a fraction of the body's mass without sloshing
 # liquid. The remaining body must have a positive mass, because CRBA adds the inertias of its
-# children to it one by one, and each partial sum must have a positive mass.
-_LARGEST_SHARE = 0.9
+# children to it one by one, and each partial sum must have a positive mass. A smaller remainder
+# would magnify rounding errors, because its centre of mass is farther away.
+_LARGEST_SHARE = 0.99
 # The displacement of a ball is converted to a rotation of the appendage about the origin of its
 # frame only if the ball is far enough from this origin. The least distance is this fraction of the
 # body's radius of gyration.
 _SHORTEST = 0.05
 # Least mass of a ball, as a fraction of the mass mu that satisfies (16.4) without a rotor inertia.
 _LIGHTEST = 1e-6
-# A participation consists of a translation (3,) and a rotation (3,). Either of them counts as zero
-# if its norm is at most this fraction of the norm of the other. To compare them in the same unit,
-# the translation is multiplied by a length, such as the radius of gyration of the body.
-_NONE = 1e-14
+# Least mass and moment of inertia to which the participation of an appendage is compared, as
+# fractions of the mass and of the mean moment of inertia of its body.
+_LEAST_SCALE = 1e-6
+# The fractions a and b of (16.4) count as zero up to this value. Tables of structural programs
+# contain numbers of 1e-16 to 1e-12 where zero is meant, and a and b are squares of such numbers.
+_NONE = 1e-24
+# Bounds of x in (16.6). Up to the first bound, a mode counts as a rotation, whose ball is at the
+# origin of the appendage's frame. From the second bound on, the ball is where r' is parallel to t.
+_TURNS, _MOVES = 1e-8, 1e-4
 
 # Fields of a robot that have joint names as keys, possibly in nested mappings. A key may also have
 # the form GROUP.JOINT, where GROUP is one of _GROUPS.
@@ -347,17 +355,16 @@ def _mounted_modes(
                     f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the "
                     "inertia in the URDF must include the appendage as if it were rigid"
                 )
-        columns = list[tuple[str, Array, Array]]()
-        for item, placement, L in items:
+        columns = list[Column]()
+        for item, placement, _ in items:
             if isinstance(item, Slosh):
                 at = placement * np.array(item.position)
                 bodies[joint] = bodies[joint] - pin.Inertia(item.mass, at, np.zeros((3, 3)))
                 parts += _liquid(item, joint, placement)
             else:
-                origins = [placement.translation] * len(item.modes)
-                columns += zip(item.modes, L.T, origins, strict=True)
+                columns += _columns(item, body, placement)
         body = bodies[joint]
-        balls = [_ball(joint, body, *column) for column in columns]
+        balls = [_ball(joint, body, column) for column in columns]
         mass = sum(ball.inertia.mass for ball in balls)
         lighter = _LARGEST_SHARE * body.mass / mass if mass else 1.0
         if lighter < _LIGHTEST:
@@ -367,7 +374,7 @@ def _mounted_modes(
                 "must include the appendage and the liquid"
             )
         if lighter < 1.0:
-            balls = [_ball(joint, body, *column, lighter) for column in columns]
+            balls = [_ball(joint, body, column, lighter) for column in columns]
         for ball in balls:
             bodies[joint] = bodies[joint] - ball.placement.act(ball.inertia)
         parts += balls
@@ -460,57 +467,126 @@ def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Arra
     return min(impossible, default=None)
 
 
-def _ball(
-    joint: int, body: pin.Inertia, name: str, column: Array, p: Array, lighter: float = 1.0
-) -> Mounted:
+class Column(NamedTuple):
+    """Modal participation of one mode, in the axes of the joint that carries the appendage.
+
+    `t` (3,) is the translation and `r` (3,) the rotation about the origin `p` (3,) of the
+    appendage's frame. `mass` and `moment` are the scales m and I of the appendage in (16.4).
+    """
+
+    name: str
+    t: Array
+    r: Array
+    p: Array
+    mass: float
+    moment: float
+
+
+def _columns(item: FlexibleAppendage, body: pin.Inertia, placement: pin.SE3) -> list[Column]:
+    """Return the modes of an appendage whose frame has the given placement on its body."""
+    T = placement.rotation @ item.translation
+    R = placement.rotation @ item.rotation
+    # The scales depend on the body only if the appendage hardly translates or hardly rotates.
+    least_moment = float(np.trace(body.inertia)) / 3.0
+    mass = max(float(np.square(T).sum()), _LEAST_SCALE * body.mass)
+    moment = max(float(np.square(R).sum()), _LEAST_SCALE * least_moment)
+    rows = zip(item.modes, T.T, R.T, strict=True)
+    return [Column(name, t, r, placement.translation, mass, moment) for name, t, r in rows]
+
+
+def _smooth_step(x: float) -> float:
+    """Return the factor s of (16.6): 0 for x <= _TURNS, and 1 for x >= _MOVES.
+
+    In between, s is a smooth function of log(x).
+    """
+    if x <= _TURNS:
+        return 0.0
+    y = min(1.0, math.log(x / _TURNS) / math.log(_MOVES / _TURNS))
+    s = y * y * (3.0 - 2.0 * y)
+    # The distance from the ball to its joint axis is proportional to 1 / (1 - s). Therefore s jumps
+    # to 1 before this distance is too large.
+    return s if 1.0 - s > 1e-6 else 1.0
+
+
+class _AtBall(NamedTuple):
+    """Modal participation of one mode about the ball.
+
+    `center` (3,) is the ball relative to the origin of the appendage's frame. About the ball, the
+    participation is `t` (3,) and r' = `along` + `across` (3,), of which `along` is parallel to t
+    and `across` is perpendicular to t. `fraction` is a + b of (16.5).
+    """
+
+    center: Array
+    t: Array
+    along: Array
+    across: Array
+    fraction: float
+
+
+def _at_ball(column: Column) -> _AtBall:
+    """Choose the ball of a mode by (16.5) and (16.6)."""
+    t, along, across, center = column.t, np.zeros(3), column.r, np.zeros(3)
+    square = float(t @ t)
+    a = square / column.mass if square else 0.0
+    if a > _NONE:
+        along = t * (float(t @ column.r) / square)
+        across = column.r - along
+        s = _smooth_step(a / (a + _square_over(across, column.moment)))
+        center = s * np.cross(t, column.r) / square
+        across = (1.0 - s) * across
+    else:
+        a, t = 0.0, np.zeros(3)
+    b = _square_over(along + across, column.moment)
+    if b <= _NONE:
+        b, along, across = 0.0, np.zeros(3), np.zeros(3)
+    return _AtBall(center, t, along, across, a + b)
+
+
+def _square_over(vector: Array, scale: float) -> float:
+    """Return |vector|^2 / scale, or 0 if the vector is zero. In this case, the scale may be 0."""
+    square = float(vector @ vector)
+    return square / scale if square else 0.0
+
+
+def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -> Mounted:
     """Return the ball that models a mode by (16.4).
 
-    In the frame of the joint `joint`, `column` (6,) is the participation of the mode, and `p` (3,)
-    is the origin of the appendage's frame. `lighter` is the mass of the ball, as a fraction of the
-    mass mu in (16.4). If `lighter` is 1, the joint needs no rotor inertia.
+    `joint` is the joint that carries the body. `lighter` is the mass of the ball, as a fraction of
+    the mass mu in (16.4). If `lighter` is 1, the joint needs no rotor inertia.
     """
-    # Convert the participation (t, r) back to the origin of the appendage's frame. There, r = 0 if
-    # the `rotation` of the appendage is zero for this mode.
-    t, r, size = column[:3], column[3:] - np.cross(p, column[:3]), _radius_of_gyration(body)
-    square, center = float(t @ t), np.zeros(3)
-    if math.sqrt(square) * size > _NONE * math.hypot(*r):
-        center = np.cross(t, r) / square
-        # Place the ball at most one radius of gyration of the body from the origin of the
-        # appendage's frame.
-        center *= min(1.0, size / max(math.hypot(*center), 1e-300))
-    else:
-        t, square = np.zeros(3), 0.0
-    r, lever = r - np.cross(center, t), math.hypot(*center)
-    rest, far = math.hypot(*r), max(size, math.hypot(*p)) * math.sqrt(square)
-    if rest <= _NONE * max(far, math.hypot(*column[3:])):
-        r, rest = np.zeros(3), 0.0
-    moment = rest**2 + size**2 * square if rest else 0.0
-    mass = square + (rest / size) ** 2 if square else 0.0
-    # Bound the rotation of the appendage for a unit amplitude. The ball rotates by |r| / moment.
-    # Its centre moves by |t| / mass, at the distance `lever` from the origin of the appendage's
-    # frame. This is a rotation by at most |t| / mass / lever about this origin, which is neglected
-    # if `lever` is too short. The bound does not depend on `lighter`, because `mass` is still mu.
-    rotation = rest / moment if moment else 0.0
-    if mass and lever >= _SHORTEST * size:
-        rotation += math.sqrt(square) / mass / lever
-    mass, center, sphere = lighter * mass, p + center, moment * np.eye(3)
+    at = _at_ball(column)
+    t, r, center, offset = at.t, at.along + at.across, column.p + at.center, np.zeros(3)
+    mass = at.fraction * column.mass
+    moment = at.fraction * column.moment if r.any() else 0.0
     v, w = t / (mass or 1.0), r / (moment or 1.0)
-    moving, turning = math.hypot(*v), math.hypot(*w)
+    moving, turning, lever = math.hypot(*v), math.hypot(*w), math.hypot(*at.center)
+    # Bound the rotation of the appendage for a unit amplitude. The ball rotates by |w|. Its centre
+    # moves by |v|, at the distance `lever` from the origin of the appendage's frame. This is a
+    # rotation by at most |v| / lever about this origin, which is neglected if `lever` is too short.
+    # The bound does not depend on `lighter`, because `mass` is still mu.
+    rotation = turning
+    if moving and lever >= _SHORTEST * _radius_of_gyration(body):
+        rotation += moving / lever
+    mass, v, moving = lighter * mass, v / lighter, moving / lighter
+    motion: pin.JointModel = pin.JointModelPZ()
     if turning:
-        axis, scale = w / turning, turning
-        origin, pitch = center + np.cross(w, v) / turning**2, float(v @ w) / turning**2
-        motion: pin.JointModel = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+        axis, scale, pitch = w / turning, turning, float(v @ w) / turning**2
+        # w x v / |w|^2, where only the part of w across v counts. It is exactly 0 for s = 1.
+        offset = np.cross(at.across, v) / (moment * turning**2)
+        motion = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+    elif moving:
+        axis, scale = v / moving, moving
     else:
-        axis, scale = (v / moving, moving) if moving else (np.eye(3)[2], 1.0)
-        origin, motion = center, pin.JointModelPZ()
+        axis, scale = np.array([0.0, 0.0, 1.0]), 1.0
     # The modal mass of 1 is the sum of S^T I S, which is t @ v + r @ w, and of the rotor inertia
     # `rotor`. If the mass of the ball is less than mu in (16.4), S^T I S exceeds 1, and `rotor` is
     # negative. If the participation is zero, S = 0 and `rotor` = 1.
     rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
-    mode = Joint(name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
-    inertia = pin.Inertia(mass, R.T @ (center - origin), sphere)
-    return Mounted(mode, joint, pin.SE3(R, origin), motion, inertia, rotor / scale**2)
+    mode = Joint(column.name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
+    inertia = pin.Inertia(mass, R.T @ -offset, moment * np.eye(3))
+    placement = pin.SE3(R, center + offset)
+    return Mounted(mode, joint, placement, motion, inertia, rotor / scale**2)
 
 
 def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
