@@ -3,15 +3,16 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.analysis import mechanics
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
-from fflin.base.errors import InputError, StabilizabilityError
+from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
+from fflin.base.tables import counted, folded
 from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap, selection
@@ -73,6 +74,23 @@ class ReducedModel(LinearModel):
     coordinates: Array
     margin: Margin
     notes: tuple[str, ...]
+    # `margin` is the certainty of rank decisions, not the disk margin that titles show.
+    _untitled: ClassVar[frozenset[str]] = frozenset({"margin"})
+
+    def _report(self) -> str:
+        """Return the title, the numbers of states and conserved momenta, and the notes."""
+        count = len(self.momenta)
+        momenta = f"{count} conserved {'momentum' if count == 1 else 'momenta'}"
+        states = f"{len(self.S)} of {counted(len(self.T), 'state')} are kept: "
+        notes = (f"note: {note}" for note in self.notes)
+        return folded(
+            [
+                repr(self),
+                states + listed(self.state_names),
+                f"{momenta} and the coordinates with these rates are removed",
+                *notes,
+            ]
+        )
 
 
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
