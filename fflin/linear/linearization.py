@@ -133,8 +133,8 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # The dynamics do not depend on ignorable coordinates. In orbit, the dynamics depend on the
     # position and the attitude of the base. For other robots, the position is ignorable, because
     # gravity is zero or uniform. If gravity is zero, the attitude relative to a moving reference
-    # (`lin.moving`) is also ignorable. A rotor that moves towards a position limit does not keep its
-    # motion, so its angle is not ignorable.
+    # (`lin.moving`) is also ignorable. A rotor that moves towards a position limit does not keep
+    # its motion, so its angle is not ignorable.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     rates = dict(zip(lin.state_names, lin.x0.tolist(), strict=True))

@@ -411,9 +411,10 @@ class Robot(Coordinates):
         return self.wheels_at(np.zeros(self.nv))
 
     def wheels_at(self, v: Array) -> dict[str, float]:
-        """Return inertias {name: inertia [kg m^2]} of the joints that are flown as wheels at v (nv,).
+        """Return inertias {name: inertia [kg m^2]} of the joints that are flown as wheels.
 
-        These are the robot's `wheels`, and the rotors without position limits that spin at v.
+        `v` (nv,) is the velocity at the operating point. The joints are the robot's `wheels`, and
+        the rotors without position limits that spin at v.
         """
         speeds = {joint.name: float(v[joint.idx_v]) for joint in self.joints}
         known = self.reaction_wheels

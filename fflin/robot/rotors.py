@@ -1,9 +1,10 @@
 """Rotors, and the joints that are flown as reaction wheels.
 
-A rotor is a joint whose position does not affect the dynamics, such as the spin of a balanced wheel.
-At rest, such a joint may be the last joint of a wrist, whose position must be held. A wheel in turn
-is never held at a position: its angle grows without bound. So a rotor is flown as a reaction wheel
-only if it spins at the operating point, or if the robot's field `wheel_joints` names it.
+A rotor is a joint whose position does not affect the dynamics, such as the joint of a balanced
+wheel. At rest, a rotor may also be the last joint of an arm, whose position must be held. The angle
+of a wheel, in contrast, grows without bound and is never held. Therefore a rotor is flown as a
+reaction wheel only if it spins at the operating point, or if the robot's field `wheel_joints` names
+it.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ _ASYMMETRY = 1e-12
 # leaves at a joint at rest, and far below the speeds of wheels: one turn takes ten weeks.
 SPINNING = 1e-6
 
-# Position limits count as missing if they are at least this far apart [rad]. A wheel with a speed of
-# 1000 rad/s needs 30 years for this rotation.
+# Position limits count as missing if they are at least this far apart [rad]. A wheel with a speed
+# of 1000 rad/s needs 30 years for this rotation.
 _UNREACHABLE = 1e12
 
 

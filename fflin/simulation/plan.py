@@ -132,19 +132,27 @@ class Plan:
             if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+        # `target` is the target state (nx,) or None. `reference` is a function of time that returns
+        # q, v and u of the motion that the policy follows, or None.
+        self.target = target_of(state, lin if options.target is None else options.target)
+        self.reference = follows if options.target is None else None
+        # Inertias {name: inertia [kg m^2]} of the joints that are flown as wheels at the target.
+        self.flown = robot.wheels_at(self._final_velocity())
         # {state or input: (least, largest)}: the limits that saturation enforces.
         self.acting = chosen_limits(robot, options.limits)
         self.limits = saturation(
-            robot, self.acting, self.q, times.dt, times.sample, pulsed=policy is not None
+            robot,
+            self.acting,
+            self.q,
+            times.dt,
+            times.sample,
+            wheels=self.flown,
+            pulsed=policy is not None,
         )
         # `initial` (nu,) are the inputs that act until the first command arrives. Without a law,
         # these inputs act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
-        # `target` is the target state (nx,) or None. `reference` is a function of time that returns
-        # q, v and u of the motion that the policy follows, or None.
-        self.target = target_of(state, lin if options.target is None else options.target)
-        self.reference = follows if options.target is None else None
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
         # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
         # If `near` is None, this angle is within half a turn of 0.
@@ -169,6 +177,15 @@ class Plan:
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
+
+    def _final_velocity(self) -> Array:
+        """Return the velocity (nv,) of the target at the end; the initial velocity if no target."""
+        if self.reference is not None:
+            end: Array = self.reference(self.times.steps * self.times.dt)[1]
+            return end
+        if self.target is not None:
+            return self.plant.state.to_pinocchio(self.target)[1]
+        return self.v
 
     def replace(self, **changes: object) -> Plan:
         """Return a copy of the plan with some attributes replaced."""
@@ -394,7 +411,8 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     history[0, : len(start)] = start
     for row, after in pairwise(history):
         after[:] = loop @ row
-    away, wheels = np.zeros(len(history), dtype=bool), {f"q_m.{name}" for name in robot.wheels}
+    away = np.zeros(len(history), dtype=bool)
+    wheels = {f"q_m.{name}" for name in lin.wheels}
     for group in ("q_b", "r_b", "q_m"):
         judged = {name for name in fed_back(policy) if group_of(name) == group} - wheels
         of = [i for i, name in enumerate(lin.state_names) if name in judged]
