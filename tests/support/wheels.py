@@ -71,7 +71,7 @@ def spun(axes, *, others=(), J=0.02, arm=True, **fields):
 
 
 def matched(lin, other):
-    """Indices of the states and inputs of `lin` in the order of the states and inputs of `other`."""
+    """Indices of the states and of the inputs of `lin`, in the order of `other`."""
     inputs = [name.removeprefix("tau_m.wheel") for name in lin.input_names]
     wanted = [name.removeprefix("wheel") for name in other.input_names]
     states = [lin.state_names.index(name) for name in other.state_names]
