@@ -273,26 +273,16 @@ def require_fixed_point(lin: LinearModel) -> None:
     # The message lists the largest rates first. Their magnitudes are rounded, because the last
     # digits differ between processors and would change the order of equal rates.
     sizes = [float(f"{size:.5g}") for size in np.abs(rate).tolist()]
-    moving = [
-        i
+    shown = [
+        f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
         for i in np.argsort(-np.array(sizes), kind="stable")
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]
-    shown = [f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}" for i in moving]
     advice = (
         "linearise about a fixed point, with the q and u of fflin.equilibrium (--equilibrium, in "
         "orbit --relative-equilibrium), or about a steady motion with moving=True"
     )
-    # The angle of a rotor is ignorable unless it moves towards a position limit.
-    rotors = lin._robot.rotors if lin._robot else ()
-    names = (lin.state_names[i].removeprefix("q_m.") for i in moving)
-    limited = next((name for name in names if name in rotors), None)
-    if limited:
-        advice = (
-            f"joint '{limited}' cannot keep its speed, because it has position limits; remove "
-            "them (type continuous in the URDF), or set the speed to 0"
-        )
-    elif lin.moving:
+    if lin.moving:
         advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
     raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")
 

@@ -260,8 +260,8 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     if moving:
         reason = (
             f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "
-            "link is symmetric about the axis and carries nothing, without position limits; set "
-            "all other joint rates to 0"
+            "link is symmetric about the axis and carries nothing; set all other joint rates to "
+            "0"
         )
     elif orbiting and max(turns, moves) > TOLERANCE:
         reason = "the base moves in the orbital frame; remove the velocity of the base"

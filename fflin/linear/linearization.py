@@ -24,7 +24,6 @@ from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
-from fflin.robot.rotors import SPINNING
 
 # The sum of the squared entries of each array of a model must be below this value. For larger
 # values, the computation of eigenvalues would overflow.
@@ -133,14 +132,10 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # The dynamics do not depend on ignorable coordinates. In orbit, the dynamics depend on the
     # position and the attitude of the base. For other robots, the position is ignorable, because
     # gravity is zero or uniform. If gravity is zero, the attitude relative to a moving reference
-    # (`lin.moving`) is also ignorable. A rotor that moves towards a position limit does not keep
-    # its motion, so its angle is not ignorable.
+    # (`lin.moving`) is also ignorable.
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
-    rates = dict(zip(lin.state_names, lin.x0.tolist(), strict=True))
-    free = robot.free_rotors
-    rotors = [x for x in robot.rotors if x in free or abs(rates[f"qdot_m.{x}"]) <= SPINNING]
-    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in rotors))
+    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
 
 
 class Linearizer:

@@ -277,8 +277,7 @@ class LinearModel(ModelHeader, StateSpace):
 
         - the base position, except in orbit;
         - the angles of rotors, which are joints whose link is symmetric about the joint axis and
-          carries no other link. A rotor that moves must have no position limits, which it would
-          reach;
+          carries no other link;
         - the base attitude, for `moving` models without gravity.
         """
         return () if self._ignorable is None else self._ignorable(self)
