@@ -113,8 +113,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     minimal. With springs, the reduced model may still contain vibrations that no input drives. The
     reduced model and the full model have the same transfer function from inputs to joint states.
 
-    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
-    control is kept. The speeds and angles of three kinds of wheels are kept:
+    Reaction wheels, which ``lin.wheels`` lists, are also removed, even if they store momentum
+    (9.4), but the attitude that they control is kept. The speeds and angles of three kinds of
+    wheels are kept:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
