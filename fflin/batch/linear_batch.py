@@ -290,7 +290,8 @@ class LinearBatch(ModelHeader):
         first = self[0]
         header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
-        if isinstance(wheels := self._asked.get("_wheels"), FlownWheels):
+        wheels = first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
+        if isinstance(wheels, FlownWheels):
             header["_wheels"] = wheels
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 

@@ -140,8 +140,9 @@ def plan(
     if not (isinstance(free, list | tuple) and all(isinstance(name, str) for name in free)):
         raise InputError(f"free is {free!r}, expected a list of state names, such as ['r_b']")
     t, actuation = np.linspace(0.0, duration, knots), Actuation(state)
-    shooting = Shooting(robot, t, hold == "previous", robot.wheels_at(end[1]))
-    acting = chosen_limits(robot, limits)
+    wheels = robot.wheels_at(end[1])
+    shooting = Shooting(robot, t, hold == "previous", wheels)
+    acting = chosen_limits(robot, limits, wheels)
     low, high = input_limits(robot, acting)
     if R is None:
         size = np.maximum(np.abs(low), np.abs(high))

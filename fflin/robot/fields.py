@@ -34,10 +34,13 @@ def _input_keys(robot: Robot) -> tuple[str, ...]:
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
-def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
+def _given_limits(
+    given: object, robot: Robot, wheels: Iterable[str] | None = None
+) -> dict[str, Range]:
     """Return limits as {input or state: (least, largest)}.
 
-    `given` contains limits by name, or is one limit for all inputs. Limits of thrusters are raised
+    `given` contains limits by name, or is one limit for all inputs. `wheels` are the joints that
+    are flown as wheels, by default the wheels of the robot. Limits of thrusters are raised
     to at least 0, because a thruster never pulls.
     """
     named = robot.named_inputs
@@ -54,10 +57,11 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     # unbounded angles, and rotate much faster than joints.
     groups: Sequence[str] = ("q_m", "qdot_m")
     mounted = [own[0] for item, own in named if item.GROUP == "wheel"]
-    wheels = {f"{x}.{name}" for name in (*mounted, *robot.wheel_joints) for x in groups}
+    spun = robot.wheel_joints if wheels is None else wheels
+    excluded = {f"{x}.{name}" for name in (*mounted, *spun) for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
     found = by_name("input or state", whole, (*keys, *states))
-    found = {i: limits for i, limits in found.items() if names[i] not in wheels}
+    found = {i: limits for i, limits in found.items() if names[i] not in excluded}
     found |= by_name("input or state", of_states, (*keys, *states))
     found |= by_name("input", of_inputs, keys)
     return {names[i]: (max(low, floors[i]), max(up, floors[i])) for i, (low, up) in found.items()}
@@ -260,8 +264,13 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
+def chosen_limits(
+    robot: Robot, limits: object, wheels: Iterable[str] | None = None
+) -> dict[str, Range]:
     """Return the limits that the argument `limits` selects.
+
+    Limits of all joints, such as ``{"qdot_m": 0.1}``, do not apply to `wheels`, the joints that are
+    flown as wheels. By default, these are the wheels of the robot.
 
     `limits` is None, "urdf", one limit for all inputs, limits by name, or a list of these that
     contains "urdf". The text "urdf" selects all limits of the robot. A limit given in `limits`
@@ -278,7 +287,7 @@ def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
                 )
             own = limits_of(robot)
         elif part is not None:
-            given |= _given_limits(part, robot)
+            given |= _given_limits(part, robot, wheels)
     return own | given
 
 

@@ -148,7 +148,7 @@ class Plan:
         # Inertias {name: inertia [kg m^2]} of the joints that are flown as wheels at the target.
         self.flown = robot.wheels_at(self._final_velocity(goal))
         # {state or input: (least, largest)}: the limits that saturation enforces.
-        self.acting = chosen_limits(robot, options.limits)
+        self.acting = chosen_limits(robot, options.limits, self.flown)
         self.limits = saturation(
             robot,
             self.acting,
