@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -12,6 +12,7 @@ from fflin.analysis import mechanics, moving_points
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
+from fflin.base.tables import counted, folded
 from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap, selection
@@ -19,6 +20,7 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
+from fflin.robot.rotors import motor_of
 
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
@@ -73,6 +75,23 @@ class ReducedModel(LinearModel):
     coordinates: Array
     margin: Margin
     notes: tuple[str, ...]
+    # `margin` is the certainty of rank decisions, not the disk margin that titles show.
+    _untitled: ClassVar[frozenset[str]] = frozenset({"margin"})
+
+    def _report(self) -> str:
+        """Return the title, the numbers of states and conserved momenta, and the notes."""
+        count = len(self.momenta)
+        momenta = f"{count} conserved {'momentum' if count == 1 else 'momenta'}"
+        states = f"{len(self.S)} of {counted(len(self.T), 'state')} are kept: "
+        notes = (f"note: {note}" for note in self.notes)
+        return folded(
+            [
+                repr(self),
+                states + listed(self.state_names),
+                f"{momenta} and the coordinates with these rates are removed",
+                *notes,
+            ]
+        )
 
 
 def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
@@ -94,8 +113,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     minimal. With springs, the reduced model may still contain vibrations that no input drives. The
     reduced model and the full model have the same transfer function from inputs to joint states.
 
-    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
-    control is kept. The speeds and angles of three kinds of wheels are kept:
+    Reaction wheels, which ``lin.wheels`` lists, are also removed, even if they store momentum
+    (9.4), but the attitude that they control is kept. The speeds and angles of three kinds of
+    wheels are kept:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
@@ -273,7 +293,7 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
 
 
 def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
-    """Return the names of the inputs that drive reaction wheels."""
+    """Return the names of the inputs of type `ReactionWheel`, with or without an inertia."""
     keys = (key.partition(".") for key in input_keys(lin))
     return tuple(name for group, _, name in keys if group == "wheel")
 
@@ -286,7 +306,7 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     """
     # A wheel speed affects other states if the link that carries the wheel rotates at the operating
     # point, or if the wheel has friction.
-    nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
+    nv, wanted = len(lin.M), {f"q_m.{name}" for name in lin.wheels}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
         return at, at
@@ -314,8 +334,13 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     forces = rigid_forces(without(lin.generator or lin, free))
     sizes = divisors(np.linalg.norm(forces.values, axis=0))
     idle = null_space(forces @ np.diag(1.0 / sizes))[0]
-    motors = [lin.input_names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
-    spun = image(idle[motors], _ROUNDING)[0]
+    motors = [motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m.")) for i in free]
+    # A wheel without a motor has a zero row: no combination of inputs spins it alone.
+    torques = np.zeros((len(free), idle.shape[1]))
+    for row, motor in enumerate(motors):
+        if motor is not None:
+            torques[row] = idle[motor]
+    spun = image(torques, _ROUNDING)[0]
     return np.delete(free, echelon(spun, np.ones(len(free)))[1])
 
 
@@ -324,7 +349,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     # The model omits the `removed_wheels`. For every other wheel, it omits the angle if the angle
     # affects no other state, so the model may have fewer positions than rates. It also omits the
     # coordinates of the base position on which no input acts, and their rates.
-    if not wheel_inputs(lin):
+    if not (wheel_inputs(lin) or lin.wheels):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
     driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
@@ -398,6 +423,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
         "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
+        "_wheels": partial(given, lin.wheels),
         "drift": None if lin.drift is None else S @ lin.drift,
         "_inertia": partial(given, frozen(M)),
     }

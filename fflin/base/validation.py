@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -235,10 +235,13 @@ class Result(FrozenArrays):
     """Mixin for results that can be saved in files; ``print`` shows the report of a result."""
 
     verified: bool
+    # Attributes that have the name of an entry of `_TITLE` but another meaning.
+    _untitled: ClassVar[frozenset[str]] = frozenset()
 
     def __repr__(self) -> str:
         """Return a title with the robot, the numbers of points and signals, and the accuracy."""
-        parts = [said(getattr(self, key)) for key, said in _TITLE.items() if hasattr(self, key)]
+        shown = [key for key in _TITLE if key not in self._untitled and hasattr(self, key)]
+        parts = [_TITLE[key](getattr(self, key)) for key in shown]
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def __str__(self) -> str:

@@ -181,7 +181,10 @@ class Uncertain:
         Parameters
         ----------
         gain : Gain or array_like (nu, nx)
-            Gain K, which must stabilise the robot at the middle of the ranges.
+            Gain K, which must stabilise the robot at the middle of the ranges. For a `Gain`, only
+            the states in `Gain.regulated`, and states that affect them, must be stable. For an
+            array, all states must be stable. For example, a gain of reaction wheels does not
+            stabilise the wheel angles, so give the `Gain` itself.
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int

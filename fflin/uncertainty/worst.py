@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import filterfalse, islice, pairwise, product
@@ -28,6 +28,9 @@ _STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # criterion. The quick criterion of a gain uses at most _FREQUENCIES frequencies. Gradients are
 # finite differences with the step _DIFFERENCE.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
+
+# Entries of an LFT below this fraction of the largest entry of their matrix are rounding errors.
+_ROUNDING = 1e-9
 
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
@@ -73,7 +76,8 @@ class Worst:
     margin : Found
         Least disk margin at the inputs, see `Gain.margins`; 0 if a loop is unstable.
     gain : Found
-        Largest gain over all frequencies from a disturbance at the inputs to the outputs.
+        Largest gain over all frequencies from a disturbance at the inputs to the outputs. Outputs
+        that depend on states which the gain does not regulate are excluded.
     unstable : int
         Number of unstable loops among those tried.
     tried, excluded : int
@@ -116,6 +120,9 @@ class Worst:
 def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
+    kept = judged_states(lft, K, getattr(gain, "regulated", ()))
+    lft = part_of(lft, kept)
+    K = K[:, kept]
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
@@ -153,6 +160,45 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
         tried=len(tried),
         excluded=excluded + int((~physical).sum()),
         safe=safe,
+    )
+
+
+def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:
+    """Return which states (nx,) decide the stability of all loops with u = -K x.
+
+    These are the states `regulated` by the gain, the states that K feeds back, and the states that
+    affect any of these for some value of the parameters. For example, the angles and the speeds of
+    wheels are omitted if only the wheels rotate the robot: no input can regulate the total
+    momentum, which has a pole at 0. If `regulated` is empty, all states are judged.
+    """
+    if not regulated:
+        return np.full(len(lft.A), True)
+    # Omitted states have zero columns in the rows `kept` of A, and in C1. So they have zero columns
+    # in these rows of A + B1 Delta (I - D11 Delta)^-1 C1, and the matrix of every loop is block
+    # triangular.
+    kept: Mask = np.isin(lft.state_names, regulated) | K.any(axis=0)
+    kept |= np.abs(lft.C1).max(axis=0, initial=0.0) > _ROUNDING * np.abs(lft.C1).max(initial=0.0)
+    least = _ROUNDING * np.abs(lft.A).max()
+    while (acting := ~kept & (np.abs(lft.A[kept]) > least).any(axis=0)).any():
+        kept |= acting
+    return kept
+
+
+def part_of(lft: LFT, kept: Mask) -> LFT:
+    """Return the LFT of the states `kept` (nx,), with the outputs that depend on no other state."""
+    others = np.abs(lft.C2[:, ~kept]).max(axis=1, initial=0.0)
+    seen: Mask = others <= _ROUNDING * np.abs(lft.C2).max(axis=1, initial=0.0)
+    return replace(
+        lft,
+        A=lft.A[np.ix_(kept, kept)],
+        B1=lft.B1[kept],
+        B2=lft.B2[kept],
+        C1=lft.C1[:, kept],
+        C2=lft.C2[np.ix_(seen, kept)],
+        D21=lft.D21[seen],
+        D22=lft.D22[seen],
+        state_names=tuple(np.array(lft.state_names)[kept].tolist()),
+        output_names=tuple(np.array(lft.output_names)[seen].tolist()),
     )
 
 

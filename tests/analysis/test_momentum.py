@@ -213,3 +213,27 @@ def test_generalised_jacobian_is_the_reduced_models_output(robots):
     assert R @ reduced.C[:3, robot.n :] == pytest.approx(J[:3], abs=1e-12)
     with pytest.raises(fflin.UnknownNameError, match="tool"):
         fflin.generalized_jacobian(robot, q, "tol")
+
+
+def test_the_report_states_what_is_kept_and_what_is_removed():
+    """A printed reduction, of a spacecraft that floats free and of one whose base is driven."""
+    arm = fflin.load("planar_detumble")
+    for inputs, momenta in ((motors(arm), 6), ([*motors(arm), BaseTorque()], 3)):
+        lin = fflin.linearize(arm.replace(inputs=inputs))
+        for model in (lin, lin.discretize(0.1)):
+            reduced = fflin.momentum_reduction(model)
+            assert len(reduced.momenta) == momenta
+            title, *report = str(reduced).splitlines()
+            assert title == repr(reduced) and title.startswith(
+                "ReducedModel('planar_detumble', nx="
+            )
+            text = " ".join(line.strip() for line in report)
+            assert f"{18 - 2 * momenta} of 18 states are kept: {reduced.state_names[0]}" in text
+            assert f"{momenta} conserved momenta and the coordinates" in text
+
+
+def test_the_report_states_ranks_that_are_undecided():
+    arm = fflin.load("planar_detumble")
+    reduced = fflin.momentum_reduction(fflin.linearize(arm.replace(inputs=motors(arm))))
+    assert "note: in doubt" in str(replace(reduced, notes=("in doubt",)))
+    assert "note:" not in str(reduced)

@@ -325,7 +325,9 @@ def test_a_mode_with_the_whole_mass_of_a_free_link_is_refused():
     t = np.array([[0.0], [0.0], [math.sqrt(rigid.mass)]])
     r = np.cross(com, t[:, 0])[:, None]
     robot = rigid.replace(appendages=[fflin.FlexibleAppendage("root_joint", 0.3, t, r, name="all")])
-    with pytest.raises(fflin.SingularInertiaError, match="'all_mode_1'.*give the link more inertia"):
+    with pytest.raises(
+        fflin.SingularInertiaError, match="'all_mode_1'.*give the link more inertia"
+    ):
         fflin.linearize(robot)
     part = fflin.FlexibleAppendage("root_joint", 0.3, 0.999 * t, 0.999 * r, name="part")
     assert fflin.linearize(rigid.replace(appendages=[part])).certificate.route_A < 1e-10

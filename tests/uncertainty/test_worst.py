@@ -1,6 +1,7 @@
 """The worst loop of a set of robots, and how far the set is surely safe."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -262,3 +263,113 @@ def test_of_many_parameters_some_corners_are_tried(monkeypatch):
     parts = ["mass", "inertia.xx", "inertia.yy"]
     of = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
     assert of.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
+
+
+def wheeled(others=(), **fields):
+    """A cubesat with three wheels, of which a small one has another inertia."""
+    sizes = (2e-4, 2e-4, 1e-4)
+    axes = np.eye(3)
+    pairs = zip(axes, sizes, strict=True)
+    wheels = [fflin.ReactionWheel(axis, inertia=size) for axis, size in pairs]
+    return fflin.load("cubesat", inputs=[*others, *wheels], **fields)
+
+
+WHEELED = {
+    "wheels alone": wheeled,
+    "speeds regulated": lambda: wheeled([fflin.BaseTorque()]),
+    "position regulated": lambda: wheeled([fflin.BaseForce()]),
+    "wheels with friction": lambda: wheeled([fflin.BaseTorque()], damping={"wheel_1": 1e-5}),
+}
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        "wheels alone",
+        "wheels with friction",
+        pytest.param("speeds regulated", marks=pytest.mark.exhaustive),
+        pytest.param("position regulated", marks=pytest.mark.exhaustive),
+    ],
+)
+def test_stability_is_that_of_the_regulated_states(layout):
+    """Worst figures compared with loops of robots built again, over their regulated states."""
+    robot = WHEELED[layout]()
+    ranges = {"base.density": (0.6, 1.5), "base.inertia.xy": (-5e-4, 5e-4), "wheel_3.inertia": 0.5}
+    gain = fflin.lqr(fflin.linearize(robot))
+    of = fflin.uncertain(robot, ranges)
+    found = of.worst(gain, samples=5)
+    kept = [gain.state_names.index(name) for name in gain.regulated]
+    assert len(kept) < len(gain.state_names)
+    K, scale = gain.K[:, kept], np.sqrt(gain.R.diagonal())
+    frequencies = np.geomspace(1e-3, 10.0, 60)
+    damping, margins, gains = [], [], []
+    for delta in of.draws(25, seed=7)[0]:
+        lin = fflin.linearize(of.at(of.values(delta)))
+        A, B = lin.A[np.ix_(kept, kept)], lin.B[kept]
+        F = A - B @ K
+        poles = np.linalg.eigvals(F)
+        damping.append((-poles.real / np.abs(poles)).min())
+        for w in frequencies:
+            x = np.linalg.solve(1j * w * np.eye(len(F)) - F, B)
+            gains.append(np.linalg.norm(x, 2))
+            loop = 0.5 * np.eye(len(K)) - scale[:, None] * K @ x / scale
+            margins.append(1.0 / np.linalg.norm(loop, 2))
+    assert found.unstable == 0 and found.safe > 0.0
+    assert 0.0 < found.damping.value <= min(damping) * (1.0 + 1e-9)
+    assert found.margin.value <= min(*margins, 2.0) * (1.0 + 1e-9)
+    assert found.gain.value >= max(gains) * (1.0 - 1e-9)
+    # The figures are of the robots at the parameters that the result names.
+    lin = fflin.linearize(of.at(found.damping.parameters))
+    poles = np.linalg.eigvals(lin.A[np.ix_(kept, kept)] - lin.B[kept] @ K)
+    assert (-poles.real / np.abs(poles)).min() == pytest.approx(found.damping.value, rel=1e-6)
+
+
+def test_unstable_loops_of_wheels_are_counted():
+    """Wheels whose torques are rotated about z by 60 deg: heavy robots become unstable."""
+    robot = wheeled()
+    gain = fflin.lqr(fflin.linearize(robot))
+    angle = np.radians(60.0)
+    rotation = np.eye(3)
+    rotation[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    rotated = replace(gain, K=rotation @ gain.K)
+    of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
+    found = of.worst(rotated, samples=10)
+    kept = [gain.state_names.index(name) for name in gain.regulated]
+    tried = [np.zeros(1), -np.ones(1), np.ones(1), *of.draws(10, seed=0)[0]]
+    growth = []
+    for delta in tried:
+        lin = fflin.linearize(of.at(of.values(delta)))
+        loop = lin.A[np.ix_(kept, kept)] - lin.B[kept] @ rotated.K[:, kept]
+        growth.append(np.linalg.eigvals(loop).real.max())
+    count = np.count_nonzero(np.array(growth) >= 0.0)
+    assert found.tried == len(tried) and 0 < count < len(tried)
+    assert found.unstable == count and found.margin.value == 0.0
+    # The limit of stability lies outside the guaranteed ranges.
+    unstable = [abs(delta[0]) for delta, rate in zip(tried, growth, strict=True) if rate >= 0.0]
+    assert 0.0 < found.safe <= min(unstable)
+
+
+@pytest.mark.parametrize("sign, given", [(-1.0, "Gain"), (1.0, "array")])
+def test_a_gain_that_does_not_stabilise_is_refused(sign, given):
+    """An array names no regulated states, so the pole at 0 of the total momentum counts."""
+    robot = wheeled()
+    gain = fflin.lqr(fflin.linearize(robot))
+    K = sign * gain.K
+    law = replace(gain, K=K) if given == "Gain" else K
+    with pytest.raises(fflin.InputError, match="the middle of the ranges is unstable"):
+        fflin.uncertain(robot, {"base.density": 0.2}).worst(law, samples=5)
+
+
+def test_states_that_affect_regulated_states_are_judged():
+    """x1 is regulated; x2 acts on x1, x3 on x2 by a parameter; nothing depends on x4."""
+    robot = fflin.load("cubesat")
+    lft = fflin.uncertain(robot, {"base.density": 0.2}).lft()
+    A, B1, C1 = np.zeros((4, 4)), np.zeros((4, 1)), np.zeros((1, 4))
+    A[0, 1], A[3, 0] = 1.0, 1.0
+    B1[1], C1[0, 2] = 1.0, 1.0
+    names = ("x1", "x2", "x3", "x4")
+    made = replace(lft, A=A, B1=B1, C1=C1, state_names=names)
+    kept = worst.judged_states(made, np.zeros((2, 4)), ("x1",))
+    assert kept.tolist() == [True, True, True, False]
+    fed_back = np.array([[0.0, 0.0, 0.0, 1.0]])
+    assert worst.judged_states(made, fed_back, ("x1",)).all()
