@@ -292,7 +292,7 @@ def require_stabilizable(lin: LinearModel) -> None:
     missed = "the inputs cannot stabilise {}; add inputs"
     if len(lin.A) < 2 * len(lin.M):  # the model has wheel speeds without wheel angles
         robot = lin._robot
-        if robot and any(robot.damping.get(name) for name in robot.wheels):
+        if robot and any(robot.damping.get(name) for name in lin.wheels):
             missed += ", or remove the damping of the wheels"
         said = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
         return _conclude(StabilizabilityError, *said)

@@ -157,8 +157,9 @@ def second_order(lin: LinearModel) -> SecondOrder:
     # `spin`, the largest angular rate of the base and the joints.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
     spin = float(np.abs(turns).max(initial=0.0))
-    noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
-    noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
+    units = _units_of_spin(lin, size)
+    noise[:, :nv] += _OF_SPIN * np.outer(units, units) * spin**2
+    noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(units, units) * spin
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # The norm of each column of S sets the threshold for the entries of this column.
@@ -169,6 +170,21 @@ def second_order(lin: LinearModel) -> SecondOrder:
         D=ranks.without_rounding(D @ -np.eye(nv), size, size),
         S=ranks.without_rounding(S, size, each),
     )
+
+
+def _units_of_spin(lin: LinearModel, size: Array) -> Array:
+    """Return the square roots (nv,) of the inertias that determine the rounding errors of a spin.
+
+    `size` (nv,) contains the square roots of the diagonal of M. The entry of a wheel contains only
+    the inertia about the wheel's axis. But the dynamics are computed with the inertia of its body
+    about the origin of the base, which may be a thousand times larger. This inertia is at most the
+    largest moment of inertia of the whole robot.
+    """
+    names = lin.state_names[: len(size)]
+    wheels = {f"q_m.{name}" for name in lin.wheels}
+    spins = np.array([name in wheels for name in names])
+    turns = np.array(lin.state_units[-len(size) :]) == "rad/s"
+    return np.where(spins, size[turns].max(initial=0.0), size)
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:

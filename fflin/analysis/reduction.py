@@ -20,6 +20,7 @@ from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
+from fflin.robot.rotors import motor_of
 
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
 Part = TypeVar("Part", bound=LinearModel)
@@ -112,8 +113,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     minimal. With springs, the reduced model may still contain vibrations that no input drives. The
     reduced model and the full model have the same transfer function from inputs to joint states.
 
-    Reaction wheels are also removed, even if they store momentum (9.4), but the attitude that they
-    control is kept. The speeds and angles of three kinds of wheels are kept:
+    Reaction wheels, which ``lin.wheels`` lists, are also removed, even if they store momentum
+    (9.4), but the attitude that they control is kept. The speeds and angles of three kinds of
+    wheels are kept:
 
     - wheels whose speeds are to be controlled (9.5);
     - wheels on a carrier that rotates at the operating point;
@@ -267,7 +269,7 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
 
 
 def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
-    """Return the names of the inputs that drive reaction wheels."""
+    """Return the names of the inputs of type `ReactionWheel`, with or without an inertia."""
     keys = (key.partition(".") for key in input_keys(lin))
     return tuple(name for group, _, name in keys if group == "wheel")
 
@@ -280,7 +282,7 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     """
     # A wheel speed affects other states if the link that carries the wheel rotates at the operating
     # point, or if the wheel has friction.
-    nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
+    nv, wanted = len(lin.M), {f"q_m.{name}" for name in lin.wheels}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
         return at, at
@@ -308,8 +310,13 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     forces = rigid_forces(without(lin.generator or lin, free))
     sizes = divisors(np.linalg.norm(forces.values, axis=0))
     idle = null_space(forces @ np.diag(1.0 / sizes))[0]
-    motors = [lin.input_names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
-    spun = image(idle[motors], _ROUNDING)[0]
+    motors = [motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m.")) for i in free]
+    # A wheel without a motor has a zero row: no combination of inputs spins it alone.
+    torques = np.zeros((len(free), idle.shape[1]))
+    for row, motor in enumerate(motors):
+        if motor is not None:
+            torques[row] = idle[motor]
+    spun = image(torques, _ROUNDING)[0]
     return np.delete(free, echelon(spun, np.ones(len(free)))[1])
 
 
@@ -318,7 +325,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     # The model omits the `removed_wheels`. For every other wheel, it omits the angle if the angle
     # affects no other state, so the model may have fewer positions than rates. It also omits the
     # coordinates of the base position on which no input acts, and their rates.
-    if not wheel_inputs(lin):
+    if not (wheel_inputs(lin) or lin.wheels):
         return lin
     source, nv = lin.generator or lin, len(lin.M)
     driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
@@ -392,6 +399,7 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
         "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
+        "_wheels": partial(given, lin.wheels),
         "drift": None if lin.drift is None else S @ lin.drift,
         "_inertia": partial(given, frozen(M)),
     }

@@ -21,6 +21,7 @@ from fflin.batch.files import is_constant, read_rows, write_rows
 from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel, ModelHeader
+from fflin.robot.rotors import FlownWheels
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array, Indices, Mask
@@ -256,12 +257,15 @@ class LinearBatch(ModelHeader):
             header = json.loads(texts["header"])
             found = _checked_fields(arrays, header, constant)
             ignorable = tuple(header["_ignorable"])
+            # Files of earlier versions do not contain the wheels.
+            wheels = FlownWheels(*map(tuple, header["_wheels"])) if "_wheels" in header else None
             n = float(header["mean_motion"])
         if robot is None:
             asked = {
                 "_certify": partial(_refuse, "certificate", found["robot"]),
                 "_inertia": partial(_refuse, "inertia M", found["robot"]),
                 "_ignorable": partial(given, ignorable),
+                "_wheels": wheels,
                 **{"weights": {}, "mean_motion": n, "dt": 0.0},
             }
             return LinearBatch(**found, _asked=asked, verified=verified)
@@ -286,6 +290,9 @@ class LinearBatch(ModelHeader):
         first = self[0]
         header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
+        wheels = first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
+        if isinstance(wheels, FlownWheels):
+            header["_wheels"] = wheels
         return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
 
     def _model(self, index: int) -> LinearModel:

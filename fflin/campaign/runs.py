@@ -6,7 +6,7 @@ of the statistics does not depend on the duration of the run.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -84,15 +84,15 @@ def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
     return found
 
 
-def kinds_of(state: StateMap) -> Indices:
-    """Return the index into KINDS of each state (nx,).
+def kinds_of(state: StateMap, wheels: Collection[str]) -> Indices:
+    """Return the index into KINDS of each state (nx,); `wheels` are the joints flown as wheels.
 
     The index is -1 for the angles of wheels, whose errors are not counted. The index is 0 for the
     attitude and for the states without a kind, which are modes and wheel speeds. States with index
     0 do not affect the error of any kind, because the attitude error is the rotation angle.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
-    groups, wheels, modes = state.groups, state.robot.wheels, state.robot.modes
+    groups, modes = state.groups, state.robot.modes
     for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
         kind[group] = number
     kind[groups.qdot_m] = len(KINDS) - 1
@@ -136,7 +136,7 @@ class CampaignJob:
             self.plan = self.plan.replace(limits=Saturation(-most, most))
         self.judge, self.over = judge, over
         self.plant, times = self.plan.plant, self.plan.times
-        self.kinds = kinds_of(self.plant.state)
+        self.kinds = kinds_of(self.plant.state, self.plan.flown)
         self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fflin.analysis.reduction import regulated_part, wheel_inputs
+from fflin.analysis.reduction import regulated_part
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
@@ -52,7 +52,7 @@ class Loop:
         instance("robot", robot, Robot, "a fflin.Robot")
         K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
         kept = getattr(gain, "regulated", ())
-        part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
+        part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))
         if part.state_names == kept:  # omit states that are not fed back and cannot settle
             K, lin = K @ selection(kept, lin.state_names).T, part
         self.robot, self.lin, self.K = robot, lin, K

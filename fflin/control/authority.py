@@ -14,6 +14,7 @@ from fflin.robot.equipment.assembly import carrier
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
+from fflin.robot.rotors import spin_axis
 
 # Number of facet normals that `least_reach` computes in one batch.
 _FACETS = 20_000
@@ -122,19 +123,33 @@ def point_properties(robot: Robot, q: Array, v: Array) -> PointProperties:
 
 def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
     """Return the wheels' momentum relative to their carriers, and the wheels' momentum capacity."""
-    limits, wheels, axes = limits_of(robot), named_wheels(robot.inputs), np.zeros((0, 3))
-    stored, largest = np.zeros((2, len(wheels)))
-    for k, (name, wheel) in enumerate(wheels):
+    limits = limits_of(robot)
+    axes, stored, largest = list[Array](), list[float](), list[float]()
+
+    def add_joint(name: str, inertia: float) -> None:
+        most = limits.get(f"qdot_m.{name}", (0.0, math.inf))[1]
+        stored.append(inertia * float(v[robot.joint(name).idx_v]))
+        largest.append(inertia * most)
+
+    for name, wheel in named_wheels(robot.inputs):
         joint, axis = carrier(robot.model, wheel)
-        axes = np.vstack((axes, data.oMi[joint].rotation @ axis))
-        stored[k], largest[k] = wheel.momentum, math.inf
+        axes.append(data.oMi[joint].rotation @ axis)
         if wheel.inertia:
-            most = limits.get(f"qdot_m.{name}", (0.0, math.inf))[1]
-            stored[k], largest[k] = wheel.inertia * np.array((v[robot.joint(name).idx_v], most))
-    rank = int(np.linalg.matrix_rank(axes, tol=1e-6)) if len(wheels) else 0
-    bounded = rank == 3 and np.isfinite(largest).all()
-    least = least_reach(axes.T, -largest, largest, np.eye(3)) if bounded else None
-    return WheelMomentum(len(wheels), stored @ axes, rank, least)
+            add_joint(name, wheel.inertia)
+        else:
+            stored.append(wheel.momentum)
+            largest.append(math.inf)
+    for name, inertia in robot.wheels_at(v).items():
+        if name not in robot.reaction_wheels:
+            joint = robot.model.getJointId(name)
+            axes.append(data.oMi[joint].rotation @ spin_axis(robot, joint))
+            add_joint(name, inertia)
+    directions = np.array(axes).reshape(-1, 3)
+    most = np.array(largest)
+    rank = int(np.linalg.matrix_rank(directions, tol=1e-6)) if axes else 0
+    bounded = rank == 3 and np.isfinite(most).all()
+    least = least_reach(directions.T, -most, most, np.eye(3)) if bounded else None
+    return WheelMomentum(len(axes), np.array(stored) @ directions, rank, least)
 
 
 def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthority:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -15,6 +15,7 @@ from fflin.kernel import loop as rules
 from fflin.kernel.tree import empty
 from fflin.robot.fields import Range, input_limits
 from fflin.robot.robot import Robot
+from fflin.robot.rotors import motor_of
 
 Inputs: TypeAlias = Callable[..., Array]
 
@@ -37,21 +38,32 @@ class Saturation(NamedTuple):
 
 
 def saturation(
-    robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int, *, pulsed: bool
+    robot: Robot,
+    limits: Mapping[str, Range],
+    q: Array,
+    dt: float,
+    sample: int,
+    *,
+    wheels: Iterable[str],
+    pulsed: bool,
 ) -> Saturation:
     """Return the saturation at q, for integration steps of dt [s] and `sample` steps per sample.
 
-    `sample` is 0 for continuous commands. If `pulsed` is True, pulsed thrusters fire
-    pulses. Otherwise, they follow their commands without pulses.
+    `sample` is 0 for continuous commands. `wheels` are the joints that are flown as reaction
+    wheels; speed limits of other joints are not enforced. If `pulsed` is True, pulsed thrusters
+    fire pulses. Otherwise, they follow their commands without pulses.
     """
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
-    if spun := [name for name in robot.wheels if f"qdot_m.{name}" in limits]:
-        names = [name for _, group in robot.named_inputs for name in group]
-        at, of_v = [names.index(x) for x in spun], [robot.joint(x).idx_v for x in spun]
+    names = [name for _, group in robot.named_inputs for name in group]
+    motors = {name: motor_of(names, name) for name in wheels if f"qdot_m.{name}" in limits}
+    driven = {name: motor for name, motor in motors.items() if motor is not None}
+    if driven:
+        spun, at = [*driven], [*driven.values()]
+        of_v = [robot.joint(name).idx_v for name in spun]
         mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[of_v]
         least_speed, most_speed = np.array([limits[f"qdot_m.{name}"] for name in spun]).T
-        wheels = rules.Wheels(
+        limited = rules.Wheels(
             at=np.array(at),
             row=np.array([6 + robot.joint_names.index(name) for name in spun]),
             least_torque=low[at],
@@ -60,7 +72,7 @@ def saturation(
             most_speed=most_speed,
             stiffness=1.0 / (mobility * dt),
         )
-        within = within._replace(wheels=wheels)
+        within = within._replace(wheels=limited)
     if not (pulsed and (thrusters := robot.pulsed_thrusters)):
         return within
     at, time = list(thrusters), sample * dt

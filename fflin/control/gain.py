@@ -21,6 +21,7 @@ from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
 from fflin.linear.model import ControlSystem, LinearModel, state_space
+from fflin.robot.rotors import SPINNING
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -289,7 +290,24 @@ def cautions(gain: Gain) -> list[str]:
             "allocate them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin "
             "simulate` do so by default if the thrusters can push in every direction"
         )
+    if stopped := _stopped_rotors(gain):
+        said.append(
+            f"the operating point moves {listed(stopped)}, which cannot spin forever, because it "
+            "has position limits; the gain regulates its angle and so stops it; remove the limits "
+            "(type continuous in the URDF) to fly it as a wheel"
+        )
     return said
+
+
+def _stopped_rotors(gain: Gain) -> list[str]:
+    """Return the names of rotors that move at the operating point but are regulated in angle."""
+    lin = gain._lin
+    if lin is None:
+        return []
+    speeds = dict(zip(lin.state_names, np.abs(lin.x0).tolist(), strict=True))
+    angles = [x for x in lin.ignorable if x.startswith("q_m.") and x in gain.regulated]
+    rotors = [x.removeprefix("q_m.") for x in angles]
+    return [x for x in rotors if speeds.get(f"qdot_m.{x}", 0.0) > SPINNING]
 
 
 def _poles(gain: Gain) -> str:

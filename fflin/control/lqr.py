@@ -61,8 +61,9 @@ def lqr(
     bandwidth, decay rate and damping of the loop, and lists any modes that still decay more slowly.
 
     For a model with reaction wheels, only the controllable states are regulated, see (9.4) of
-    docs/derivation.md; ``gain.regulated`` lists these states. Weights on the following states have
-    no effect:
+    docs/derivation.md; ``gain.regulated`` lists these states. The wheels are the joints in
+    ``lin.wheels``: each `ReactionWheel`, and each rotor that spins at the operating point or is
+    named in `Robot.wheel_joints`. Weights on the following states have no effect:
 
     - wheel angles, which are ignorable;
     - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;

@@ -237,7 +237,8 @@ def _unplanned(
             ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
             found |= {beside[i]: limit for i, limit in ranges.items()}
             parts[k] = {key: limit for key, limit in part.items() if key not in own}
-    acting = chosen_limits(robot, parts[0] if len(parts) == 1 else parts)
+    end = of.v[-1] if isinstance(of, LinearTrajectory) else of.v
+    acting = chosen_limits(robot, parts[0] if len(parts) == 1 else parts, robot.wheels_at(end))
     found |= {name: acting[name] for name in states if name in acting}
     of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))

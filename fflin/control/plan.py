@@ -140,8 +140,9 @@ def plan(
     if not (isinstance(free, list | tuple) and all(isinstance(name, str) for name in free)):
         raise InputError(f"free is {free!r}, expected a list of state names, such as ['r_b']")
     t, actuation = np.linspace(0.0, duration, knots), Actuation(state)
-    shooting = Shooting(robot, t, hold == "previous")
-    acting = chosen_limits(robot, limits)
+    wheels = robot.wheels_at(end[1])
+    shooting = Shooting(robot, t, hold == "previous", wheels)
+    acting = chosen_limits(robot, limits, wheels)
     low, high = input_limits(robot, acting)
     if R is None:
         size = np.maximum(np.abs(low), np.abs(high))
@@ -286,6 +287,7 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
 
     `limits` (2, k) contains the lower and upper limits of all states and inputs.
     """
+    wheels = {shooting.state.names[i].removeprefix("q_m.") for i in shooting.wheels}
     state, values = shooting.state, np.hstack((shooting.limited_values(made.q, made.v), made.u))
     names, units = state.names + input_keys(actuation), state.units + actuation.units
     bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
@@ -294,7 +296,7 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
     for i in np.flatnonzero(np.isfinite(limits).any(axis=0)):
         k = int(shares[:, i].argmax())
         said = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
-        group = group_of(names[i]), names[i].removeprefix("qdot_m.") in state.robot.wheels
+        group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
         found[group] = max(found.get(group, (0.0, said)), (float(shares[k, i]), said))
     said = ", ".join(said.replace(" ", "\u00a0") for _, said in found.values())
     return f"\nnearest to their limits at the knots: {said}" if said else ""

@@ -419,7 +419,7 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     """Return the model at rest at knot `end`, in base axes. Only rotors keep their speeds."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
-    rotors = robot.rotors
+    rotors = robot.free_rotors
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
     v[spinning] = traj.v[end, spinning]
     held = equilibrium(robot, q, v=v)

@@ -439,9 +439,10 @@ class Scales:
         """
         mobility, lin, robot = self.mobility, self._lin, self._state.robot
         speed, momentum = np.abs(self._state.velocities(v)), 0.0
+        wheels = robot.wheels_at(v)
         for i, name in enumerate(robot.joint_names, 6):
-            if name in robot.wheels:  # a wheel counts by its momentum, not by its speed
-                momentum += robot.wheels[name] * float(speed[i])
+            if name in wheels:  # a wheel counts by its momentum, not by its speed
+                momentum += wheels[name] * float(speed[i])
                 speed[i] = 0.0
         for _, stored in robot.stored_momentum:
             momentum += float(np.linalg.norm(stored))

@@ -58,7 +58,8 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "limits": ("limit",),
 }
 _NAMES = [f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS]
-_LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
+_LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names")
+_OPTIONAL = ("wheels",)  # lists that files of earlier versions lack
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
@@ -117,7 +118,10 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
     """Read the fields and the certificate of a model from a file; see `LinearModel.load`."""
     with reading(path, "linear model"):
         entries, verified = read_record(path)
-        fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
+        lists = [key for key in _LISTS if key in entries or key not in _OPTIONAL]
+        fields: dict[str, Any] = {key: texts(entries[key]) for key in lists}
+        if "wheels" in fields:
+            fields["_wheels"] = partial(given, fields.pop("wheels"))
         fields |= {key: text(entries[key]) for key in _TEXTS}
         fields |= {key: figure(entries[key]) for key in _FIGURES}
         if fields["frame"] not in get_args(Frame):

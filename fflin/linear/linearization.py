@@ -93,6 +93,7 @@ class Prepared:
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
             "_ignorable": partial(ignorable_states, robot),
+            "_wheels": partial(wheels_of, robot),
             "_limits": partial(magnitudes_of, robot),
             "weights": robot.weights,
             "mean_motion": robot.orbit.mean_motion if robot.orbit else 0.0,
@@ -135,6 +136,11 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
+
+
+def wheels_of(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
+    """Return the names of the joints that are flown as wheels in a linear model of this robot."""
+    return robot.flown_wheels(lin)
 
 
 class Linearizer:

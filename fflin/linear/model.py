@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, optional_package
+from fflin.base.names import input_keys
 from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
 from fflin.base.writing import as_path
 from fflin.dynamics.integrators import held_exponential
@@ -187,6 +188,7 @@ class LinearModel(ModelHeader, StateSpace):
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
+    _wheels: Callable[[LinearModel], tuple[str, ...]] | None = None
     drift: Array | None = None
     # Fingerprint of this model, and the source model, which has the certificate. The field is None
     # if this model has its own certificate. The source of a discretised model is the
@@ -279,6 +281,24 @@ class LinearModel(ModelHeader, StateSpace):
         - the base attitude, for `moving` models without gravity.
         """
         return () if self._ignorable is None else self._ignorable(self)
+
+    @cached_property
+    def wheels(self) -> tuple[str, ...]:
+        """Names of the joints that are flown as reaction wheels.
+
+        Designs do not regulate the angles of these joints, because no other state depends on them.
+        The joints are:
+
+        - each `ReactionWheel` with an inertia;
+        - the joints in `Robot.wheel_joints`;
+        - the rotors without position limits that spin at the operating point, see `ignorable`.
+        """
+        if self._wheels is not None:
+            return self._wheels(self)
+        # A model from another source than `linearize` is known only by its names.
+        keys = (key.partition(".") for key in input_keys(self))
+        named = (name for group, _, name in keys if group == "wheel")
+        return tuple(name for name in named if f"qdot_m.{name}" in self.state_names)
 
     @cached_property
     def limits(self) -> Mapping[str, float]:

@@ -34,10 +34,13 @@ def _input_keys(robot: Robot) -> tuple[str, ...]:
     return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
-def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
+def _given_limits(
+    given: object, robot: Robot, wheels: Iterable[str] | None = None
+) -> dict[str, Range]:
     """Return limits as {input or state: (least, largest)}.
 
-    `given` contains limits by name, or is one limit for all inputs. Limits of thrusters are raised
+    `given` contains limits by name, or is one limit for all inputs. `wheels` are the joints that
+    are flown as wheels, by default the wheels of the robot. Limits of thrusters are raised
     to at least 0, because a thruster never pulls.
     """
     named = robot.named_inputs
@@ -53,10 +56,12 @@ def _given_limits(given: object, robot: Robot) -> dict[str, Range]:
     # A limit of the whole group q_m or qdot_m does not apply to wheels, because wheels have
     # unbounded angles, and rotate much faster than joints.
     groups: Sequence[str] = ("q_m", "qdot_m")
-    wheels = {f"{x}.{own[0]}" for item, own in named if item.GROUP == "wheel" for x in groups}
+    mounted = [own[0] for item, own in named if item.GROUP == "wheel"]
+    spun = robot.wheel_joints if wheels is None else wheels
+    excluded = {f"{x}.{name}" for name in (*mounted, *spun) for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
     found = by_name("input or state", whole, (*keys, *states))
-    found = {i: limits for i, limits in found.items() if names[i] not in wheels}
+    found = {i: limits for i, limits in found.items() if names[i] not in excluded}
     found |= by_name("input or state", of_states, (*keys, *states))
     found |= by_name("input", of_inputs, keys)
     return {names[i]: (max(low, floors[i]), max(up, floors[i])) for i, (low, up) in found.items()}
@@ -86,10 +91,11 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
                 f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}"
             )
         return dict(robot.urdf_damping)
+    joints = [name for name in robot._bare.joint_names if name not in robot.wheel_joints]
     if what != "rest" and not isinstance(value, Mapping):
-        value = dict.fromkeys(robot._bare.joint_names, value)
+        value = dict.fromkeys(joints, value)
     values = numbers(what, value, "joint", f"{what} of joint")
-    found = by_joint(values, robot._bare.joint_names, robot.joint)
+    found = by_joint(values, joints, robot.joint)
     for name, entry in found.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
@@ -153,11 +159,11 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
     return rule | {part: entries for part, entries in weights.items() if entries}
 
 
-def checked_passive(value: object, bare: Robot) -> tuple[str, ...]:
-    """Return the names of the passive joints in state order; `value` has names or patterns."""
+def checked_names(what: str, value: object, bare: Robot) -> tuple[str, ...]:
+    """Return the names of joints in state order from the field `what`, names or patterns."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
-        raise InputError(f"passive is {value!r}, expected names of joints")
+        raise InputError(f"{what} is {value!r}, expected names of joints")
     found = by_joint(dict.fromkeys(keys), bare.joint_names, bare.joint)
     return tuple(name for name in bare.joint_names if name in found)
 
@@ -170,10 +176,10 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 
 
 # Checks of the fields, in the order in which the fields of a robot file are applied. Inputs come
-# before the fields that refer to inputs by name. The first three fields have no check here, because
+# before the fields that refer to inputs by name. The first four fields have no check here, because
 # `Robot.replace` checks them itself.
 FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
-    **dict.fromkeys(("passive", "inputs", "appendages")),
+    **dict.fromkeys(("passive", "wheel_joints", "inputs", "appendages")),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),
@@ -258,8 +264,13 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
-def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
+def chosen_limits(
+    robot: Robot, limits: object, wheels: Iterable[str] | None = None
+) -> dict[str, Range]:
     """Return the limits that the argument `limits` selects.
+
+    Limits of all joints, such as ``{"qdot_m": 0.1}``, do not apply to `wheels`, the joints that are
+    flown as wheels. By default, these are the wheels of the robot.
 
     `limits` is None, "urdf", one limit for all inputs, limits by name, or a list of these that
     contains "urdf". The text "urdf" selects all limits of the robot. A limit given in `limits`
@@ -276,7 +287,7 @@ def chosen_limits(robot: Robot, limits: object) -> dict[str, Range]:
                 )
             own = limits_of(robot)
         elif part is not None:
-            given |= _given_limits(part, robot)
+            given |= _given_limits(part, robot, wheels)
     return own | given
 
 

@@ -44,10 +44,6 @@ _ZERO = 1e-12
 # orthonormal basis of these motions exceeds this value.
 _INVOLVED = 0.1
 
-# Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
-# rounding of numbers in a URDF.
-_ASYMMETRY = 1e-12
-
 
 def dynamic_parameters(model: pin.Model) -> bytes:
     """Return the mass properties of all bodies as bytes, for a hash of the robot."""
@@ -339,37 +335,3 @@ def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Ar
         turning = values > _NO_MOMENT * values[2]
         rows.append(axes[:, turning].T @ J[3:])
     return np.vstack(rows)
-
-
-def rotor_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of the rotors: joints whose body is symmetric about the joint axis.
-
-    A rotor carries no other joint, is not the leader of a mimic joint, and has no spring. No input
-    or output is mounted on its body.
-    """
-    model = robot.model
-    index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
-    named = set(robot.used_frames)
-    # `busy` contains the indices of joints that cannot be rotors.
-    busy = set(model.parents.tolist())
-    busy |= {index_of[follower.leader.name] for follower in robot.followers}
-    busy |= {index_of[name] for name, stiffness in robot.stiffness.items() if stiffness}
-    if named:
-        busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
-    free = {name: index for name, index in index_of.items() if index not in busy}
-    return tuple(name for name, index in free.items() if _is_symmetric(robot, index))
-
-
-def _is_symmetric(robot: Robot, index: int) -> bool:
-    """Return whether the body of a joint is symmetric about the joint axis."""
-    pin_joint = robot.model.joints[index]
-    data = pin_joint.createData()
-    pin_joint.calc(data, robot.neutral())
-    linear, axis = np.split(np.asarray(data.S).ravel(), 2)
-    if linear.any():  # a joint that translates
-        return False
-    body, turn = robot.model.inertias[index], skew(axis)
-    uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
-    largest = float(np.abs(body.inertia).max())
-    offset = body.mass * float(np.square(turn @ body.lever).sum())
-    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

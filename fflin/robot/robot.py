@@ -17,11 +17,18 @@ from fflin.base.validation import Array
 from fflin.robot import mass_properties
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
-from fflin.robot.fields import FIELDS, Range, checked_passive, pulsed_thrusters
+from fflin.robot.fields import FIELDS, Range, checked_names, pulsed_thrusters
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_inputs, named_wheels
 from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
+from fflin.robot.rotors import (
+    flown_wheels,
+    free_rotor_names,
+    require_free_rotors,
+    rotor_names,
+    spin_inertia,
+)
 
 
 class Springs(NamedTuple):
@@ -83,6 +90,8 @@ class Robot(Coordinates):
         Folders that are searched for ``package://`` meshes when the robot is drawn.
     passive : tuple of str
         Joints without a motor.
+    wheel_joints : tuple of str
+        Joints of the URDF that are flown as reaction wheels even at rest, see `replace`.
     weights : mapping
         Default weights of `lqr`, which take precedence over the weights of the rule "urdf" or
         "identity"; see `replace`.
@@ -127,6 +136,7 @@ class Robot(Coordinates):
     orbit: CircularOrbit | None = None
     package_dirs: tuple[Path, ...] = ()
     passive: tuple[str, ...] = ()
+    wheel_joints: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)
     point: Mapping[str, Any] = field(default_factory=dict)
     target: Mapping[str, Any] = field(default_factory=dict)
@@ -178,6 +188,12 @@ class Robot(Coordinates):
             `CircularOrbit`. None removes the orbit.
         passive : sequence of str
             Names of joints without a motor. Their torques are removed from the inputs.
+        wheel_joints : sequence of str
+            Names of joints of the URDF that are flown as reaction wheels even if they are at rest.
+            Designs do not regulate the angles of wheels, and reports do not judge them. The link of
+            each joint must be balanced and symmetric about the joint axis, and the joint must have
+            no spring and no position limits. Such a joint need not be named if it spins at the
+            operating point.
         weights : mapping
             Default weights of `lqr` under its keywords ``rule``, ``q``, ``r`` and ``bryson``.
             ``rule`` is "urdf" or "identity". ``q`` and ``r`` are weights, and ``bryson`` contains
@@ -213,6 +229,7 @@ class Robot(Coordinates):
 
             - a value is negative or not a number;
             - a wheel has a larger inertia than the link that carries it;
+            - a joint in `wheel_joints` cannot spin freely;
             - both gravity and an orbit are given.
         UnknownNameError
             If a field, a joint, a frame of an input or output, or a name in `limits` does not
@@ -234,9 +251,12 @@ class Robot(Coordinates):
         require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            robot = replace(self, passive=checked_passive(fields["passive"], self._bare))
+            robot = replace(self, passive=checked_names("passive", fields["passive"], self._bare))
             driven = [x for x in self.inputs if getattr(x, "joint", None) not in robot.passive]
             fields = {"inputs": driven, **fields}
+        if "wheel_joints" in fields:
+            named = checked_names("wheel_joints", fields["wheel_joints"], self._bare)
+            robot = replace(robot, wheel_joints=named)
         if "inputs" in fields:
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
@@ -257,6 +277,7 @@ class Robot(Coordinates):
             )
         for name in robot.used_frames:
             find_frame(robot.model, name)
+        require_free_rotors(robot)
         return robot
 
     def with_mass_properties(self, bodies: Mapping[str, object]) -> Robot:
@@ -371,13 +392,34 @@ class Robot(Coordinates):
 
     pulsed_thrusters = cached_property(pulsed_thrusters)
     idle_coordinates = cached_property(mass_properties.idle_coordinates)
-    rotors = cached_property(mass_properties.rotor_names)
+    rotors = cached_property(rotor_names)
+    free_rotors = cached_property(free_rotor_names)
+    flown_wheels = cached_property(flown_wheels)
+
+    @cached_property
+    def reaction_wheels(self) -> dict[str, float]:
+        """Inertias {name: inertia [kg m^2]} of the inputs `ReactionWheel` that are joints."""
+        wheels = named_wheels(self.inputs)
+        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
 
     @cached_property
     def wheels(self) -> dict[str, float]:
-        """Inertias {name: inertia [kg m^2]} of the reaction wheels that are joints of the robot."""
-        wheels = named_wheels(self.inputs)
-        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
+        """Inertias {name: inertia [kg m^2]} of the joints that are always flown as wheels.
+
+        These are the inputs `ReactionWheel` with an inertia, and the joints in `wheel_joints`.
+        """
+        return self.wheels_at(np.zeros(self.nv))
+
+    def wheels_at(self, v: Array) -> dict[str, float]:
+        """Return inertias {name: inertia [kg m^2]} of the joints that are flown as wheels.
+
+        `v` (nv,) is the velocity at the operating point. The joints are the robot's `wheels`, and
+        the rotors without position limits that spin at v.
+        """
+        speeds = {joint.name: float(v[joint.idx_v]) for joint in self.joints}
+        known = self.reaction_wheels
+        names = self.flown_wheels.at(speeds)
+        return {x: known.get(x) or spin_inertia(self, x) for x in names}
 
     stored_momentum = cached_property(stored_momentum)
 

@@ -24,7 +24,7 @@ Lock = Mapping[str, float | None] | Iterable[str]
 def welded(robot: Robot, lock: Lock) -> Robot:
     """Return a robot with joints and wheels welded; `lock` gives their names and positions."""
     bare, asked = robot._bare, requested(lock)
-    wheels = {name for name in asked if name in robot.wheels}
+    wheels = {name for name in asked if name in robot.reaction_wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}
     mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
     model, left, locked = locked_model(bare.model, at, mimics)
@@ -47,11 +47,12 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     ]
     locked = (*robot.locked, *locked)
     passive = tuple(name for name in robot.passive if name not in gone)
+    spun = tuple(name for name in robot.wheel_joints if name not in gone)
     kept = tuple(x for x in outputs if getattr(x, "joints", None) != ())
     joints = tuple(joint.within(model) for joint in bare.joints if joint.name not in gone)
     followers = tuple(f.within(model) for f in bare.followers if f.joint.name in left)
     bare = replace(bare, model=model, joints=joints, followers=followers, locked=locked)
-    robot = replace(robot, locked=locked, passive=passive, outputs=kept)
+    robot = replace(robot, locked=locked, passive=passive, wheel_joints=spun, outputs=kept)
     return equipped(robot, bare, inputs=inputs)
 
 

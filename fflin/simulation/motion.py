@@ -88,7 +88,8 @@ class Motion(StatesAndInputs, Design):
     stopped : str
         Reason why the run ended early; empty if the run was completed.
     wheels : tuple of str
-        Joints that are reaction wheels. The reported errors do not include wheel angles.
+        Joints that are flown as reaction wheels at the target: each `ReactionWheel`, and rotors
+        that spin there, see `LinearModel.wheels`. The reported errors do not include wheel angles.
     wheel_inertias : ndarray (k,)
         Inertias of the wheels about their axes [kg m^2]; empty if the motion was read from a file
         without these inertias.

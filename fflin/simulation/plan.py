@@ -16,7 +16,16 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import group_of
-from fflin.base.validation import Array, ArrayLike, instance, number, truth, vector, whole
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    as_double,
+    instance,
+    number,
+    truth,
+    vector,
+    whole,
+)
 from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
 from fflin.control.linear_controller import closed_loop
 from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
@@ -132,19 +141,29 @@ class Plan:
             if not callable(given) and (given is not None or name == "event"):
                 kind = type(given).__name__
                 raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+        # `reference` is a function of time that returns q, v and u of the motion that the policy
+        # follows, or None.
+        self.reference = follows if options.target is None else None
+        goal = lin if options.target is None else options.target
+        # Inertias {name: inertia [kg m^2]} of the joints that are flown as wheels at the target.
+        self.flown = robot.wheels_at(self._final_velocity(goal))
         # {state or input: (least, largest)}: the limits that saturation enforces.
-        self.acting = chosen_limits(robot, options.limits)
+        self.acting = chosen_limits(robot, options.limits, self.flown)
         self.limits = saturation(
-            robot, self.acting, self.q, times.dt, times.sample, pulsed=policy is not None
+            robot,
+            self.acting,
+            self.q,
+            times.dt,
+            times.sample,
+            wheels=self.flown,
+            pulsed=policy is not None,
         )
         # `initial` (nu,) are the inputs that act until the first command arrives. Without a law,
         # these inputs act throughout the run.
         self.law = law_of(policy, plant, self.limits, times)
         self.initial = _initial_inputs(policy, plant, self.limits)
-        # `target` is the target state (nx,) or None. `reference` is a function of time that returns
-        # q, v and u of the motion that the policy follows, or None.
-        self.target = target_of(state, lin if options.target is None else options.target)
-        self.reference = follows if options.target is None else None
+        # Target state (nx,), or None if there is no target.
+        self.target = target_of(state, goal)
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
         # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
         # If `near` is None, this angle is within half a turn of 0.
@@ -169,6 +188,26 @@ class Plan:
         self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
         self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
+
+    def _final_velocity(self, goal: LinearModel | ArrayLike | None) -> Array:
+        """Return the velocity (nv,) of the target at the end; the initial velocity if no target.
+
+        Joints that `goal` does not name are at rest. `target_of` raises the errors about `goal`.
+        """
+        if self.reference is not None:
+            end: Array = self.reference(self.times.steps * self.times.dt)[1]
+            return end
+        if goal is None:
+            return self.v
+        state = self.plant.state
+        names, x = state.names, goal
+        if isinstance(goal, LinearModel):
+            names, x = goal.state_names, goal.x0
+        rates = dict(zip(names, np.ravel(as_double("target", x)).tolist(), strict=False))
+        v = np.zeros(state.robot.nv)
+        for joint in state.robot.joints:
+            v[joint.idx_v] = rates.get(f"qdot_m.{joint.name}", 0.0)
+        return v
 
     def replace(self, **changes: object) -> Plan:
         """Return a copy of the plan with some attributes replaced."""
@@ -394,7 +433,8 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     history[0, : len(start)] = start
     for row, after in pairwise(history):
         after[:] = loop @ row
-    away, wheels = np.zeros(len(history), dtype=bool), {f"q_m.{name}" for name in robot.wheels}
+    away = np.zeros(len(history), dtype=bool)
+    wheels = {f"q_m.{name}" for name in lin.wheels}
     for group in ("q_b", "r_b", "q_m"):
         judged = {name for name in fed_back(policy) if group_of(name) == group} - wheels
         of = [i for i, name in enumerate(lin.state_names) if name in judged]

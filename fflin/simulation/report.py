@@ -108,7 +108,14 @@ def curves(motion: Motion) -> Iterator[Curve]:
         input_keys(motion), motion.input_names, motion.input_units, motion.u.T, strict=True
     )
     for key, name, unit, column in inputs:
-        yield Curve(key, key.partition(".")[0], name, unit, column, limits.get(name, unlimited))
+        bounds = limits.get(name, unlimited)
+        yield Curve(key, group_of_input(motion, key), name, unit, column, bounds)
+
+
+def group_of_input(motion: Motion, key: str) -> str:
+    """Return the group of an input GROUP.NAME, which is "wheel" for the motor of any wheel."""
+    group, _, name = key.partition(".")
+    return "wheel" if group == "tau_m" and name in motion.wheels else group
 
 
 class Passed(NamedTuple):
@@ -425,7 +432,7 @@ def _largest_inputs(motion: Motion) -> str:
     kinds: dict[tuple[str, str], float] = {}
     for name, unit, value in zip(input_keys(motion), motion.input_units, largest, strict=True):
         if value >= _NOTHING:
-            key = (group_of(name), unit.replace(" ", "\u00a0"))
+            key = (group_of_input(motion, name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
     shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
     # Non-breaking spaces keep a name, its value and the unit on one line.

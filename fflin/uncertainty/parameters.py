@@ -98,7 +98,7 @@ class Parameters(dict[str, Parameter]):
         try:
             self._bodies(values)
             # Also create the robot, because a link may be too light for its wheels or modes.
-            if self._robot.wheels or self._robot.modes:
+            if self._robot.reaction_wheels or self._robot.modes:
                 self.robot(values)
         except InputError as error:
             return str(error)

@@ -270,14 +270,16 @@ def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
     return poses
 
 
-def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
+def errors(
+    robot: Robot, q: Array, target: Array, wheels: Collection[str]
+) -> dict[str, tuple[str, Array]]:
     """Return {quantity: (unit, errors (N,))} of q (N, nq) from the target.
 
-    Wheels and modes are excluded.
+    The joints `wheels` and modes are excluded.
     """
     goals = np.broadcast_to(target, q.shape)
     apart = np.array([pin.difference(robot.model, *each) for each in zip(goals, q, strict=True)])
-    joints = [joint for joint in robot.joints if not (joint.mode or joint.name in robot.wheels)]
+    joints = [joint for joint in robot.joints if not (joint.mode or joint.name in wheels)]
     turning = [joint.idx_v for joint in joints if not joint.prismatic]
     sliding = [joint.idx_v for joint in joints if joint.prismatic]
     found = {
@@ -297,7 +299,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
     from the first configuration instead of errors.
     """
-    found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
+    found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1], motion.wheels)
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [

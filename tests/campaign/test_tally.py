@@ -67,7 +67,7 @@ def defined(job, target, q, nu, u, stop):
     e = x - target
     if target.ndim == 2:
         e = unwound(state, moving_errors(state.frame, x, target))
-    kind = kinds_of(state)
+    kind = kinds_of(state, state.robot.wheels)
     signed = e.copy()
     e[:, kind < 0] = 0.0
     sizes = [np.abs(e[:, kind == k]).max(axis=1, initial=0.0) for k in range(len(KINDS))]

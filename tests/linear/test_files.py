@@ -36,7 +36,7 @@ def test_round_trip_is_exact(lin, ending, dt, tmp_path):
     saved.save(path)
     loaded = fflin.LinearModel.load(path)
     for field in fields(saved):
-        made = ("_certify", "_inertia", "_ignorable", "_limits", "_robot")
+        made = ("_certify", "_inertia", "_ignorable", "_wheels", "_limits", "_robot")
         if field.name in (*made, "_source"):
             continue
         before, after = getattr(saved, field.name), getattr(loaded, field.name)
@@ -46,6 +46,7 @@ def test_round_trip_is_exact(lin, ending, dt, tmp_path):
             assert before == after and type(before) is type(after), field.name
     assert loaded.certificate == saved.certificate == lin.certificate
     assert loaded.reference == saved.reference and loaded.ignorable == saved.ignorable
+    assert loaded.wheels == saved.wheels == lin.wheels
     assert loaded.limits == saved.limits == lin.limits
     assert (loaded.M == saved.M).all() and not loaded.M.flags.writeable
     if not dt:

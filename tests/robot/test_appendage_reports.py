@@ -80,7 +80,7 @@ def test_a_large_amplitude_warns_that_the_model_is_linear_in_it():
 def test_settling_and_campaigns_do_not_take_modes_for_joints():
     robot = full()
     state = StateMap(robot)
-    kinds = dict(zip(state.names, kinds_of(state).tolist(), strict=True))
+    kinds = dict(zip(state.names, kinds_of(state, state.robot.wheels).tolist(), strict=True))
     joint = list(KINDS).index("joints")
     for name in robot.joint_names:
         mode = robot.joint(name).mode

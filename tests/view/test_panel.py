@@ -53,7 +53,7 @@ def test_errors_are_those_of_the_pose(robots):
     q = pin.integrate(robot.model, target, v)
     base = pin.XYZQUATToSE3(target[:7]) * pin.SE3(pin.exp3(step[3:]), step[:3])
     q[:7] = pin.SE3ToXYZQUAT(base)
-    found = errors(robot, np.array([target, q]), target[None])
+    found = errors(robot, np.array([target, q]), target[None], robot.wheels)
     np.testing.assert_allclose(found["attitude"][1], [0, 37.0], atol=1e-6)
     np.testing.assert_allclose(found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12)
     np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7)
@@ -70,7 +70,7 @@ def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
         (np.zeros(3), np.radians(20.0) * np.array([0, 0.6, 0.8]), 0.2 * np.ones(6))
     )
     q = np.array([pin.integrate(robot.model, each, s * step) for s, each in enumerate(targets)])
-    found = errors(robot, q, targets)
+    found = errors(robot, q, targets, robot.wheels)
     np.testing.assert_allclose(found["attitude"][1], [0, 20, 40, 60], atol=1e-6)
     np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7)
 
@@ -81,7 +81,7 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     target = robot.neutral()
     q = fflin.configuration(robot, {"panda_joint2": -0.1, "panda_finger_joint1": 0.03})
     robot.joint("wheel_1").place(q, 2.0)
-    found = errors(robot, np.array([q]), target[None])
+    found = errors(robot, np.array([q]), target[None], robot.wheels)
     assert found["largest joint"][1] == pytest.approx(np.degrees(0.1))
     assert found["largest prismatic joint"][1] == pytest.approx(0.03)
     motion = settling(robot, 1.0)
@@ -203,7 +203,7 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     titles = [each["title"] for each in shown["plots"]]
     assert labels[0] == titles[0] == "attitude change"
     assert not any("error" in text for text in labels + titles)
-    expected = errors(robot, motion.q[every(motion)], motion.q[:1])["attitude"][1]
+    expected = errors(robot, motion.q[every(motion)], motion.q[:1], motion.wheels)["attitude"][1]
     assert expected[0] < 1e-6 < 1.0 < expected[-1]
     np.testing.assert_allclose(charts(shown)[titles[0]][""], expected, rtol=1e-6, atol=1e-5)
 

@@ -1,5 +1,7 @@
 """Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pinocchio as pin
 
@@ -35,19 +37,23 @@ class Shooting:
     """Multiple shooting over N intervals between equally spaced knots.
 
     `t` (N + 1,) contains the times [s] of the knots. Inputs are constant over an interval if `held`
-    is True, and linear otherwise.
+    is True, and linear otherwise. The angles of the joints `wheels`, by
+    default the wheels of the robot, are free.
     """
 
     # A step z (nx,) from one point to another has the order of the state of a linear model, in base
     # axes. Its first three entries are a rotation vector, which is 2 q_b to first order.
 
-    def __init__(self, robot: Robot, t: Array, held: bool) -> None:
+    def __init__(
+        self, robot: Robot, t: Array, held: bool, wheels: Iterable[str] | None = None
+    ) -> None:
         self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
         self._linearizer = Linearizer(robot, moving=True)
-        self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
+        free = robot.wheels if wheels is None else wheels
+        self.wheels = [self.state.names.index(f"q_m.{name}") for name in free]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:

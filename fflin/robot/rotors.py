@@ -1,0 +1,158 @@
+"""Rotors, and the joints that are flown as reaction wheels.
+
+A rotor is a joint whose position does not affect the dynamics, such as the joint of a balanced
+wheel. At rest, a rotor may also be the last joint of an arm, whose position must be held. The angle
+of a wheel, in contrast, grows without bound and is never held. Therefore a rotor is flown as a
+reaction wheel only if it spins at the operating point, or if the robot's field `wheel_joints` names
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.fields import limits_of
+
+if TYPE_CHECKING:
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+
+# Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
+# rounding of numbers in a URDF.
+_ASYMMETRY = 1e-12
+
+# Speed [rad/s] above which a rotor spins. It is above the rates that rounding or a planned motion
+# leaves at a joint at rest, and far below the speeds of wheels: one turn takes ten weeks.
+SPINNING = 1e-6
+
+# Position limits count as missing if they are at least this far apart [rad]. A wheel with a speed
+# of 1000 rad/s needs 30 years for this rotation.
+_UNREACHABLE = 1e12
+
+
+class FlownWheels(NamedTuple):
+    """Joints that are flown as reaction wheels: `always`, or if they spin at the point."""
+
+    always: tuple[str, ...]
+    if_spinning: tuple[str, ...]
+
+    def at(self, speeds: Mapping[str, float]) -> tuple[str, ...]:
+        """Return the names of the wheels at {joint: speed [rad/s]}."""
+        spun = (x for x in self.if_spinning if abs(speeds.get(x, 0.0)) > SPINNING)
+        return tuple(dict.fromkeys((*self.always, *spun)))
+
+    def __call__(self, lin: LinearModel) -> tuple[str, ...]:
+        """Return the names of the wheels at the operating point of a linear model."""
+        states = zip(lin.state_names, lin.x0.tolist(), strict=True)
+        rates = {name: value for name, value in states if name.startswith("qdot_m.")}
+        return self.at({name.removeprefix("qdot_m."): speed for name, speed in rates.items()})
+
+
+def flown_wheels(robot: Robot) -> FlownWheels:
+    """Return which joints of a robot are flown as reaction wheels.
+
+    Joints in `wheel_joints` are omitted if they are no longer rotors, for example because a changed
+    inertia is not balanced.
+    """
+    named = tuple(name for name in robot.wheel_joints if name in robot.free_rotors)
+    return FlownWheels((*robot.reaction_wheels, *named), robot.free_rotors)
+
+
+def obstacles(robot: Robot) -> dict[str, str]:
+    """Return {joint: reason why the joint is not a rotor} for all joints that are not rotors."""
+    model = robot.model
+    carriers = set(model.parents.tolist())
+    leaders = {follower.leader.name for follower in robot.followers}
+    frames = set(robot.used_frames)
+    mounted = set[int]()
+    if frames:
+        mounted = {frame.parentJoint for frame in model.frames if frame.name in frames}
+    found = dict[str, str]()
+    for joint in robot.joints:
+        index = model.getJointId(joint.name)
+        if index in carriers:
+            found[joint.name] = "its link carries another joint"
+        elif joint.name in leaders:
+            found[joint.name] = "a mimic joint follows it"
+        elif robot.stiffness.get(joint.name):
+            found[joint.name] = "it has a spring"
+        elif index in mounted:
+            found[joint.name] = "an input or output is mounted on its link"
+        elif not _is_symmetric(robot, index):
+            found[joint.name] = "its link is not symmetric about the joint axis"
+    return found
+
+
+def rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the rotors: joints whose body is symmetric about the joint axis.
+
+    A rotor carries no other joint, is not the leader of a mimic joint, and has no spring. No input
+    or output is mounted on its body.
+    """
+    excluded = obstacles(robot)
+    return tuple(name for name in robot.joint_names if name not in excluded)
+
+
+def free_rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the rotors without position limits, which may spin forever."""
+    limits = limits_of(robot)
+
+    def is_free(name: str) -> bool:
+        least, largest = limits.get(f"q_m.{name}", (-np.inf, np.inf))
+        return largest - least >= _UNREACHABLE
+
+    return tuple(name for name in robot.rotors if is_free(name))
+
+
+def require_free_rotors(robot: Robot) -> None:
+    """Raise `InputError` if a joint in the robot's field `wheel_joints` cannot spin freely."""
+    excluded = obstacles(robot) if robot.wheel_joints else {}
+    for name in robot.wheel_joints:
+        if name not in robot.free_rotors:
+            why = excluded.get(name, "it has position limits")
+            raise InputError(
+                f"wheel_joints names joint '{name}', but {why}; name only joints that spin freely, "
+                "with a link that is balanced and symmetric about the joint axis"
+            )
+
+
+def spin_inertia(robot: Robot, name: str) -> float:
+    """Return the inertia [kg m^2] of a rotor's body about the joint axis."""
+    index = robot.model.getJointId(name)
+    axis = spin_axis(robot, index)
+    return float(axis @ robot.model.inertias[index].inertia @ axis)
+
+
+def spin_axis(robot: Robot, index: int) -> Array:
+    """Return the axis (3,) of a revolute joint in the axes of its body, zeros if it translates."""
+    joint = robot.model.joints[index]
+    data = joint.createData()
+    joint.calc(data, robot.neutral())
+    linear, axis = np.split(np.asarray(data.S, dtype=float).ravel(), 2)
+    return np.zeros(3) if linear.any() else axis
+
+
+def motor_of(inputs: Sequence[str], joint: str) -> int | None:
+    """Return the index of the torque of a wheel among the names of inputs, or None if none acts."""
+    for name in (joint, f"tau_m.{joint}"):
+        if name in inputs:
+            return inputs.index(name)
+    return None
+
+
+def _is_symmetric(robot: Robot, index: int) -> bool:
+    """Return whether the body of a joint is symmetric about the joint axis."""
+    axis = spin_axis(robot, index)
+    if not axis.any():  # a joint that translates
+        return False
+    body, turn = robot.model.inertias[index], skew(axis)
+    uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
+    largest = float(np.abs(body.inertia).max())
+    offset = body.mass * float(np.square(turn @ body.lever).sum())
+    return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest
