@@ -10,7 +10,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from fflin.base.validation import Array
 from fflin.robot.fields import limits_of
 
 if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
@@ -36,6 +35,18 @@ SPINNING = 1e-6
 _UNREACHABLE = 1e12
 
 
+class OperatingPoint(Protocol):
+    """State at an operating point, with the names of its entries, such as a `LinearModel`."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names (nx,) of the states."""
+
+    @property
+    def x0(self) -> Array:
+        """State (nx,)."""
+
+
 class FlownWheels(NamedTuple):
     """Joints that are flown as reaction wheels: `always`, or if they spin at the point."""
 
@@ -47,9 +58,9 @@ class FlownWheels(NamedTuple):
         spun = (x for x in self.if_spinning if abs(speeds.get(x, 0.0)) > SPINNING)
         return tuple(dict.fromkeys((*self.always, *spun)))
 
-    def __call__(self, lin: LinearModel) -> tuple[str, ...]:
-        """Return the names of the wheels at the operating point of a linear model."""
-        states = zip(lin.state_names, lin.x0.tolist(), strict=True)
+    def __call__(self, point: OperatingPoint) -> tuple[str, ...]:
+        """Return the names of the wheels at an operating point."""
+        states = zip(point.state_names, point.x0.tolist(), strict=True)
         rates = {name: value for name, value in states if name.startswith("qdot_m.")}
         return self.at({name.removeprefix("qdot_m."): speed for name, speed in rates.items()})
 
