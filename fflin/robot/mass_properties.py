@@ -265,8 +265,8 @@ class _Part(NamedTuple):
 
     Each row of `rows` (r, 6 + k) is a velocity on which the kinetic energy depends, as a linear
     function of the twist (6,) of the body and of the rates (k,) of its modes, in units of v. The
-    twist is in the axes of the body's joint, about the point `center` (3,). There are 6 + k rows
-    if every motion of the part has kinetic energy.
+    twist is in the axes of the body's joint, about the point `center` (3,). The modal amplitudes
+    are zero. There are 6 + k rows if every motion of the part has kinetic energy.
     """
 
     joint: int
@@ -361,10 +361,9 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     # If M is singular at two random configurations, it is almost surely singular at every
-    # configuration. Modal amplitudes are zero, because `rows` are valid only there.
+    # configuration.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
-        velocity[[joint.idx_v for joint in robot.modes]] = 0.0
         q = pin.integrate(robot.model, robot.neutral(), velocity)
         moved = _moved(robot, q, parts) @ columns
         moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
@@ -408,8 +407,7 @@ def require_inertia(robot: Robot) -> None:
 def _moved(robot: Robot, q: Array, parts: Sequence[_Part]) -> Array:
     """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
 
-    These are the rates of joints with armature and the rows of all parts. The modal amplitudes in
-    q must be zero.
+    These are the rates of joints with armature and the rows of all parts.
     """
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, q)

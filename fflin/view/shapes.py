@@ -32,6 +32,10 @@ PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
 
 _DENSITY = 1000.0  # [kg/m^3] density of a ball that represents a mass
 
+# Tables of structural programs contain rounding errors in place of zeros. For the drawing, a
+# participation counts as zero up to this fraction of the largest one, with m as unit of length.
+_NOISE = 1e-9
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -203,7 +207,7 @@ class Bending(NamedTuple):
     frame: pin.SE3  # placement of the appendage's frame on the carrier
     modes: list[int]  # indices of the modal amplitudes in q
     twist: Array  # (6, k) per unit of q: translation before rotation
-    center: Array  # (3,) centre, in `frame`, of a ball that represents the links
+    center: Array  # (3,) centre of the first mode's ball, which represents the links, in `frame`
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement, in the world, of the appendage's frame after bending."""
@@ -219,16 +223,21 @@ def bendings(robot: Robot) -> dict[str, Bending]:
         if isinstance(item, FlexibleAppendage):
             joints = [robot.joint(name) for name in item.modes]
             scale = np.array([joint.scale for joint in joints])
-            turn, shift = np.linalg.pinv(item.rotation).T, np.zeros((3, len(joints)))
-            if not turn.any():
-                shift = np.linalg.pinv(item.translation).T
-            t, r = item.translation[:, 0], item.rotation[:, 0]
+            turn = shift = np.zeros((3, len(joints)))
+            if np.abs(item.rotation).max() > _NOISE * np.abs(item.translation).max():
+                turn = np.linalg.pinv(item.rotation, rcond=_NOISE).T
+            else:
+                shift = np.linalg.pinv(item.translation, rcond=_NOISE).T
+            node = robot.model.getJointId(joints[0].name)
+            carrier, frame = find_frame(robot.model, item.frame)
+            ball = robot.model.jointPlacements[node] * robot.model.inertias[node].lever
             found[item.title] = Bending(
-                robot.model.getJointId(joints[0].name),
-                *find_frame(robot.model, item.frame),
+                node,
+                carrier,
+                frame,
                 [joint.idx_q for joint in joints],
                 np.vstack((shift, turn)) / scale,
-                np.cross(t, r) / max(float(t @ t), 1e-12),
+                frame.actInv(ball),
             )
     return found
 
@@ -264,7 +273,9 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
             yield Shape(joint, "sphere", (_radius(item.mass),), pin.SE3(np.eye(3), lever))
         elif item.frame not in bent:
             bending = bendings(robot)[item.title]
-            mass = float(np.square(item.participation[:3, 0]).sum())
+            t, r = np.split(item.participation[:, 0], 2)
+            only_rotates = np.abs(t).max() <= _NOISE * np.abs(r).max()
+            mass = 0.0 if only_rotates else float(t @ t)
             size = _radius(mass or 1.0)
             # An appendage without modal mass only rotates. It is drawn as a box, because the
             # rotation of a sphere would not be visible.

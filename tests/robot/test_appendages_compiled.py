@@ -5,6 +5,7 @@ import pytest
 
 import fflin
 from tests.robot.test_appendages import displaced, full, servicer
+from tests.robot.test_modal_forces import array_on_a_drive
 
 pytestmark = pytest.mark.compiled
 
@@ -83,6 +84,29 @@ def test_both_engines_fly_the_same_thousand_seconds(undamped):
     q, v = displaced(undamped, size=0.01)
     motions = [
         fflin.simulate(undamped, q0=q, v0=v, duration=1000.0, dt=0.05, engine=engine)
+        for engine in ("python", "compiled")
+    ]
+    scale = np.abs(motions[0].x).max(axis=0) + 1e-3
+    assert (np.abs(motions[0].x - motions[1].x) / scale).max() < 1e-11
+
+
+@pytest.mark.parametrize("noise", [1e-13, 1e-9])
+def test_both_engines_agree_on_an_array_with_noise_in_place_of_zero(noise):
+    # Noise of 1e-9 becomes screws with pitches of about 1e9 m.
+    rigid, array = array_on_a_drive(noise)
+    noisy = rigid.replace(appendages=[array])
+    points = [displaced(noisy, seed, size=0.2) for seed in range(3)]
+    q, v = (np.array(values) for values in zip(*points, strict=True))
+    batch = fflin.sweep(noisy, q, v=v)
+    for index, point in enumerate(points):
+        lin = fflin.linearize(noisy, *point)
+        assert fflin.check(noisy, lin).ok
+        for key in ("A", "B", "f0"):
+            expected = getattr(lin, key)
+            found = getattr(batch, key)[index]
+            assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+    motions = [
+        fflin.simulate(noisy, q0=q[0], v0=v[0], duration=20.0, dt=0.05, engine=engine)
         for engine in ("python", "compiled")
     ]
     scale = np.abs(motions[0].x).max(axis=0) + 1e-3

@@ -120,13 +120,13 @@ def general(seed=1, count=4):
 
 
 def heavier(rigid, factor):
-    """The rigid robot with another mass of its base: the same centre of mass and inertia."""
+    """The rigid robot with another density of its base."""
     body = rigid.model.inertias[1]
-    given = {"mass": factor * body.mass, "com": body.lever, "inertia": body.inertia}
+    given = {"mass": factor * body.mass, "com": body.lever, "inertia": factor * body.inertia}
     return rigid.with_mass_properties({"base": given})
 
 
-def test_the_mass_of_the_base_changes_no_modal_force():
+def test_the_density_of_the_base_changes_no_modal_force():
     rigid, array = general()
     found = []
     for factor in (1.0, 1.7, 40.0):
@@ -159,12 +159,12 @@ def test_sensitivity_is_the_derivative_of_robots_that_get_their_appendage_anew(k
 
     h = 1e-2
     far, near = at(1.0 + 2.0 * h) - at(1.0 - 2.0 * h), at(1.0 + h) - at(1.0 - h)
-    expected = (8.0 * near - far) / (12.0 * h * rigid.model.inertias[1].mass)
+    expected = (8.0 * near - far) / (12.0 * h)
     S = fflin.sensitivity(fflin.linearize(robot, *state.to_pinocchio(x)))
-    found = getattr(S["base.mass"], f"d{key}")
-    # The error of these differences is h^4/30 times the fifth derivative, which is 5! for 1 / mass.
+    found = getattr(S["base.density"], f"d{key}")
+    # The error of these differences is h^4/30 times the fifth derivative, which is 5! for 1/factor.
     # The rounding errors of `at` are amplified by 1 / h.
-    rounding = 1e-13 * np.abs(at(1.0)).max() / (h * rigid.model.inertias[1].mass)
+    rounding = 1e-13 * np.abs(at(1.0)).max() / h
     tolerance = 4.0 * h**4 * np.abs(expected).max() + rounding
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
     assert tolerance < 1e-6 * np.abs(expected).max()
@@ -244,7 +244,8 @@ def test_forces_are_continuous_in_the_translation_of_a_rotation():
         found.append(accelerations(robot, v, omega, eta[:1], etadot[:1]))
     change = np.abs(np.array(found) - found[0]).max(axis=1) / np.abs(found[0]).max()
     assert (change[sizes < 2e-7] < sizes[sizes < 2e-7]).all()
-    assert np.abs(np.diff(change)).max() < 0.3
+    # About 5 of 26 steps are between a rotation and a translation. A jump would be one of them.
+    assert np.abs(np.diff(change)).max() < 0.6 * np.ptp(change)
 
 
 def array_on_a_drive(noise=0.0, seed=0):
@@ -260,7 +261,7 @@ def array_on_a_drive(noise=0.0, seed=0):
     )
     drive = pin.SE3(np.eye(3), np.array([0.6, 0.0, 0.0]))
     joint = model.addJoint(base, pin.JointModelRX(), drive, "drive")
-    rod = pin.Inertia(12.0, np.array([1.05, 0.0, 0.0]), np.diag([0.05, 4.41, 4.45]))
+    rod = pin.Inertia(12.0, np.array([1.05, 0.0, 0.02]), np.diag([0.05, 4.41, 4.45]))
     model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
     for index in (base, joint):
         model.addJointFrame(index)
@@ -340,3 +341,9 @@ def test_a_mode_with_the_whole_mass_of_a_free_link_is_refused():
     )
     robot = carried.replace(appendages=[all_of_it])
     assert fflin.check(robot, fflin.linearize(robot)).ok
+    # The mode that moves like the whole array on its drive takes all inertia about the drive.
+    body = carried.model.inertias[2].matrix()
+    column = body[:, 3] / math.sqrt(body[3, 3])
+    spins = fflin.FlexibleAppendage("drive", 0.3, column[:3, None], column[3:, None], name="spins")
+    with pytest.raises(fflin.SingularInertiaError, match="joint 'drive', joint 'spins_mode_1' can"):
+        fflin.linearize(carried.replace(appendages=[spins]))

@@ -61,9 +61,26 @@ def test_an_array_without_rotation_moves_along_its_momentum():
         assert a.isApprox(pin.SE3(np.eye(3), shift) * b, 1e-12)
 
 
+@pytest.mark.parametrize("turns", [True, False])
+def test_noise_in_place_of_zero_does_not_change_how_an_array_bends(turns):
+    t = np.array([[0.0, 0.0], [0.0, 0.0], [2.71, 1.5]])
+    r = np.array([[4.27, 0.8], [0.0, 0.0], [0.0, 0.0]]) * turns
+    rigid, poses = fflin.load("inspector", lock=["hinge_*"]), []
+    for noise in (0.0, 1e-13):
+        rng = np.random.default_rng(1)
+        parts = (x + noise * rng.normal(size=(3, 2)) for x in (t, r))
+        array = fflin.FlexibleAppendage("panel_left_1", [0.25, 1.1], *parts, name="left")
+        robot = rigid.replace(appendages=[array])
+        moved = fflin.configuration(robot, {"left_mode_1": 0.3, "left_mode_2": -0.1})
+        poses.append(posed(robot, moved))
+    for one, other in zip(*poses, strict=True):
+        assert one.isApprox(other, 1e-10)
+
+
 def test_appendages_of_the_root_link_and_slosh_are_balls():
     boom = fflin.FlexibleAppendage("base", 0.3, [[2], [0], [0]], [[0], [6], [0]], name="boom")
-    twist = fflin.FlexibleAppendage("base", 0.3, np.zeros((3, 1)), [[0], [0], [1]], name="twist")
+    noise = [[1e-13], [2e-13], [0]]  # in place of zero
+    twist = fflin.FlexibleAppendage("base", 0.3, noise, [[0], [0], [1]], name="twist")
     tank = fflin.Slosh("base", 20.0, (0.0, 0.2, 0.1), frequency=0.2, name="tank")
     rigid = fflin.load("inspector", lock=["*"])
     robot = rigid.replace(appendages=[boom, twist, tank])
@@ -74,6 +91,7 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
     # The boom's mass is at r / t = 3 m, and moves by 1 / t for a unit of the amplitude.
     assert at_rest[0].translation == pytest.approx([0.0, 0.0, 3.0])
     assert (moved[0].translation - at_rest[0].translation)[0] == pytest.approx(0.05, rel=1e-3)
+    assert at_rest[1].translation == pytest.approx([0.0, 0.0, 0.0])
     assert pin.log3(moved[1].rotation) == pytest.approx([0.0, 0.0, 0.2])
     assert at_rest[2].translation == pytest.approx(tank.position)
     assert moved[2].translation - at_rest[2].translation == pytest.approx([0.05, 0.0, 0.0])

@@ -6,12 +6,8 @@ participation L (6, k). Its kinetic energy is
 
 .. math:: T = \tfrac12 V^T M_{rr} V + V^T L \dot\eta + \tfrac12 \dot\eta^T \dot\eta.
 
-Each mode is modelled by a ball on a screw joint, see (16.4) of docs/derivation.md. The ball is a
-rigid body with the spatial inertia ``I``. At unit modal rate, the ball has the twist ``S`` and the
-momentum ``I S``, which is the mode's column of L. The modal mass is ``S^T I S`` = 1. If the link is
-too light for this ball, a lighter ball is used, whose ``S^T I S`` exceeds 1. A negative rotor
-inertia of the joint then reduces the modal mass to 1. The inertia of the ball is subtracted from
-the inertia of the link. Therefore, the link and its balls together have the inertia in the URDF.
+Each mode is modelled by a ball on a screw joint, see `fflin.robot.equipment.assembly` and (16.4) of
+docs/derivation.md. The link and its balls together have the inertia in the URDF.
 """
 
 from __future__ import annotations
@@ -42,6 +38,10 @@ class FlexibleAppendage(FrozenArrays):
     angular frequency :math:`\omega` and damping ratio :math:`\zeta`, the coordinate has the
     stiffness :math:`\omega^2`, the damping :math:`2 \zeta \omega` and no motor. The link's inertia
     in the URDF must include the appendage as if it were rigid.
+
+    At rest, A and B follow from frequencies and participation alone. If the link rotates at a rate
+    w, forces of the order w^2 also depend on other integrals of the mode shapes. They are exact for
+    a straight beam that bends in one direction, and approximate otherwise.
 
     Parameters
     ----------

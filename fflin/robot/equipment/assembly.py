@@ -51,12 +51,12 @@ _LARGEST_SHARE = 0.99
 # frame only if the ball is far enough from this origin. The least distance is this fraction of the
 # body's radius of gyration.
 _SHORTEST = 0.05
-# Least mass of a ball, as a fraction of the mass mu that satisfies (16.4) without a rotor inertia.
+# Least mass of a ball, as a fraction of the mass mu of (16.5).
 _LIGHTEST = 1e-6
 # Least mass and moment of inertia to which the participation of an appendage is compared, as
 # fractions of the mass and of the mean moment of inertia of its body.
 _LEAST_SCALE = 1e-6
-# The fractions a and b of (16.4) count as zero up to this value. Tables of structural programs
+# The fractions a and b of (16.5) count as zero up to this value. Tables of structural programs
 # contain numbers of 1e-16 to 1e-12 where zero is meant, and a and b are squares of such numbers.
 _NONE = 1e-24
 # Bounds of x in (16.6). Up to the first bound, a mode counts as a rotation, whose ball is at the
@@ -471,7 +471,7 @@ class Column(NamedTuple):
     """Modal participation of one mode, in the axes of the joint that carries the appendage.
 
     `t` (3,) is the translation and `r` (3,) the rotation about the origin `p` (3,) of the
-    appendage's frame. `mass` and `moment` are the scales m and I of the appendage in (16.4).
+    appendage's frame. `mass` and `moment` are the scales m_a and I_a of the appendage in (16.5).
     """
 
     name: str
@@ -495,17 +495,17 @@ def _columns(item: FlexibleAppendage, body: pin.Inertia, placement: pin.SE3) -> 
 
 
 def _smooth_step(x: float) -> float:
-    """Return the factor s of (16.6): 0 for x <= _TURNS, and 1 for x >= _MOVES.
+    """Return the factor sigma of (16.6): 0 for x <= _TURNS, and 1 for x >= _MOVES.
 
     In between, s is a smooth function of log(x).
     """
     if x <= _TURNS:
         return 0.0
     y = min(1.0, math.log(x / _TURNS) / math.log(_MOVES / _TURNS))
-    s = y * y * (3.0 - 2.0 * y)
-    # The distance from the ball to its joint axis is proportional to 1 / (1 - s). Therefore s jumps
-    # to 1 before this distance is too large.
-    return s if 1.0 - s > 1e-6 else 1.0
+    sigma = y * y * (3.0 - 2.0 * y)
+    # The distance from the ball to its joint axis is proportional to 1 / (1 - sigma). Therefore
+    # sigma jumps to 1 before this distance is too large.
+    return sigma if 1.0 - sigma > 1e-6 else 1.0
 
 
 class _AtBall(NamedTuple):
@@ -525,20 +525,22 @@ class _AtBall(NamedTuple):
 
 def _at_ball(column: Column) -> _AtBall:
     """Choose the ball of a mode by (16.5) and (16.6)."""
-    t, along, across, center = column.t, np.zeros(3), column.r, np.zeros(3)
-    square = float(t @ t)
-    a = square / column.mass if square else 0.0
+    zero: Array = np.zeros(3)
+    t, r = column.t, column.r
+    center, along, across = zero, zero, r
+    a = _square_over(t, column.mass)
     if a > _NONE:
-        along = t * (float(t @ column.r) / square)
-        across = column.r - along
-        s = _smooth_step(a / (a + _square_over(across, column.moment)))
-        center = s * np.cross(t, column.r) / square
-        across = (1.0 - s) * across
+        square = float(t @ t)
+        along = t * (float(t @ r) / square)
+        across = r - along
+        sigma = _smooth_step(a / (a + _square_over(across, column.moment)))
+        center = sigma * np.cross(t, r) / square
+        across = (1.0 - sigma) * across
     else:
-        a, t = 0.0, np.zeros(3)
+        a, t = 0.0, zero
     b = _square_over(along + across, column.moment)
     if b <= _NONE:
-        b, along, across = 0.0, np.zeros(3), np.zeros(3)
+        b, along, across = 0.0, zero, zero
     return _AtBall(center, t, along, across, a + b)
 
 
@@ -549,13 +551,13 @@ def _square_over(vector: Array, scale: float) -> float:
 
 
 def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -> Mounted:
-    """Return the ball that models a mode by (16.4).
+    """Return the ball that models a mode by (16.4) to (16.6).
 
     `joint` is the joint that carries the body. `lighter` is the mass of the ball, as a fraction of
-    the mass mu in (16.4). If `lighter` is 1, the joint needs no rotor inertia.
+    the mass mu in (16.5). If `lighter` is 1, the joint needs no rotor inertia.
     """
     at = _at_ball(column)
-    t, r, center, offset = at.t, at.along + at.across, column.p + at.center, np.zeros(3)
+    t, r = at.t, at.along + at.across
     mass = at.fraction * column.mass
     moment = at.fraction * column.moment if r.any() else 0.0
     v, w = t / (mass or 1.0), r / (moment or 1.0)
@@ -567,25 +569,29 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     rotation = turning
     if moving and lever >= _SHORTEST * _radius_of_gyration(body):
         rotation += moving / lever
-    mass, v, moving = lighter * mass, v / lighter, moving / lighter
+    mass *= lighter
+    v, moving = v / lighter, moving / lighter
     motion: pin.JointModel = pin.JointModelPZ()
+    axis: Array = np.array([0.0, 0.0, 1.0])
+    scale = 1.0
+    offset: Array = np.zeros(3)  # from the ball to the joint axis
     if turning:
-        axis, scale, pitch = w / turning, turning, float(v @ w) / turning**2
-        # w x v / |w|^2, where only the part of w across v counts. It is exactly 0 for s = 1.
+        axis, scale = w / turning, turning
+        pitch = float(v @ w) / turning**2
+        # w x v / |w|^2, where only the part of w across v counts. It is exactly 0 for sigma = 1.
         offset = np.cross(at.across, v) / (moment * turning**2)
         motion = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
     elif moving:
         axis, scale = v / moving, moving
-    else:
-        axis, scale = np.array([0.0, 0.0, 1.0]), 1.0
     # The modal mass of 1 is the sum of S^T I S, which is t @ v + r @ w, and of the rotor inertia
-    # `rotor`. If the mass of the ball is less than mu in (16.4), S^T I S exceeds 1, and `rotor` is
+    # `rotor`. If the mass of the ball is less than mu in (16.5), S^T I S exceeds 1, and `rotor` is
     # negative. If the participation is zero, S = 0 and `rotor` = 1.
-    rotor, R = 1.0 - float(t @ v + r @ w), turned_to(axis)
+    R = turned_to(axis)
+    rotor = 1.0 - float(t @ v + r @ w)
     rotor = 0.0 if abs(rotor) < 1e-13 else rotor
     mode = Joint(column.name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
     inertia = pin.Inertia(mass, R.T @ -offset, moment * np.eye(3))
-    placement = pin.SE3(R, center + offset)
+    placement = pin.SE3(R, column.p + at.center + offset)
     return Mounted(mode, joint, placement, motion, inertia, rotor / scale**2)
 
 
