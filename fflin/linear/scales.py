@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,10 +11,19 @@ from fflin.base.validation import Array, Indices
 
 EPS = float(np.finfo(float).eps)
 
-# Largest expected ratio of a rounding error to the largest of a few sampled rounding errors.
+# Relative tolerances of comparisons with ABA derivatives and with finite differences.
+ROUTE_TOLERANCE, DIFFERENCE_TOLERANCE = 1e-9, 1e-8
+
+# Assumed rounding error [ulp] of a sum, relative to the sum of the magnitudes of its terms. The
+# first value is for accelerations, and the second one for kinematics, which are shorter sums.
+ULPS, FEW_ULPS = 64.0, 8.0
+
+# Largest expected ratio of a rounding error to the largest of a few sampled rounding errors. In
+# 2,000 random robots, the largest ratio was 13.
 _SAFETY = 20.0
 
-Blocks = Mapping[str, slice | Sequence[int] | Indices]
+# {block: its rows or columns}
+Blocks = Mapping[Any, slice | Sequence[int] | Indices]
 
 
 class Row(NamedTuple):
@@ -32,27 +41,26 @@ class Row(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """An independent matrix, the scale of each entry, and a bound of its rounding errors.
+    """Matrix of an independent computation, with a scale and a rounding error for each entry.
 
-    The scale of an entry is the size to which its error is relative. It does not depend on the
-    units of the rows and columns.
+    The scale of an entry is the size of the entries and terms to which its error is relative. It is
+    in the units of the entry, so the relative error does not depend on the units of the model.
     """
 
     value: Array
     scale: Array
     rounding: Array
 
-    def row(
-        self, test: str, block: str, given: Array, where: tuple[Array, ...], least: float
-    ) -> Row:
-        """Compare a block of a given matrix; return the row of its worst entry.
+    def errors(self, given: Array, tolerance: float) -> Array:
+        """Return the relative error of each entry of a given matrix.
 
-        `where` selects the block, as `np.ix_` returns it. `least` is the tolerance without rounding
-        errors.
+        If the rounding error of the reference exceeds the tolerance, the error is relative to the
+        rounding error divided by the tolerance. So rounding errors alone do not exceed the
+        tolerance.
         """
-        scale = np.maximum(self.scale[where], self.rounding[where] / least)
-        error = np.abs(given[where] - self.value[where]) / scale
-        return Row(test, block, float(np.max(error, initial=0.0)), least)
+        scale = np.maximum(self.scale, self.rounding / tolerance)
+        errors: Array = np.abs(given - self.value) / scale
+        return errors
 
 
 def spread_over(rows: Blocks, x: Array, row_units: Array) -> Array:
@@ -89,17 +97,34 @@ def block_scales(
     The scale is the largest entry and the largest term of the block, or one unit if the block is
     zero.
     """
+    size = block_sizes(rows, columns, np.maximum(np.abs(x), terms), row_units, column_units)
+    return np.where(size > 0.0, size, np.outer(row_units, 1.0 / column_units))
+
+
+def block_sizes(
+    rows: Blocks, columns: Blocks, x: Array, row_units: Array, column_units: Array
+) -> Array:
+    """Return the largest magnitude in each block, in the units of its rows and columns."""
     units = np.outer(row_units, 1.0 / column_units)
-    sizes = np.maximum(np.abs(x), terms) / units
-    scale = np.ones_like(sizes)
+    sizes = np.abs(x) / units
     for row in rows.values():
         for column in columns.values():
             where = np.ix_(np.arange(len(x))[row], np.arange(x.shape[1])[column])
-            scale[where] = float(sizes[where].max(initial=0.0)) or 1.0
-    return scale * units
+            sizes[where] = sizes[where].max(initial=0.0)
+    return sizes * units
 
 
 def sampled(rows: Blocks, value: Array, others: Sequence[Array], row_units: Array) -> Array:
-    """Bound the rounding errors of a matrix that was computed several times."""
+    """Bound the rounding errors of a matrix that was computed several times.
+
+    The bound of an entry is a multiple of the largest difference between the computations in the
+    same column and in the same block of rows.
+    """
     apart = np.max([np.abs(other - value) for other in others], axis=0)
-    return _SAFETY * spread_over(rows, apart, row_units)
+    bound: Array = _SAFETY * spread_over(rows, apart, row_units)
+    return bound
+
+
+def worst(test: str, block: str, errors: Array, tolerance: float) -> Row:
+    """Return the row of a comparison with these errors; the error is NaN if an entry is NaN."""
+    return Row(test, block, float(errors.max(initial=0.0)), tolerance)
