@@ -14,7 +14,7 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.rnea import Inertia
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
-from fflin.linear.scales import EPS, FEW_ULPS, Reference, block_sizes, sampled, scales
+from fflin.linear.scales import EPS, FEW_ULPS, Reference, sampled, scales, spread_over
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
@@ -33,29 +33,38 @@ class Dynamics(NamedTuple):
     by_u: Array
 
 
-def _dynamics(aba: Aba, q: Array, v: Array, u: Array) -> Dynamics:
-    """Return the accelerations by ABA and their derivatives; `u` is in base axes."""
+def _dynamics(aba: Aba, q: Array, v: Array, u: Array, inertia: Array | None = None) -> Dynamics:
+    """Return the accelerations by ABA and their derivatives; `u` is in base axes.
+
+    If M (6 + n, 6 + n) in base axes is given as `inertia`, the result contains M^-1 in place of the
+    inverse that ABA computes. If links are far apart, ABA is less accurate than CRBA.
+    """
     state = aba.state
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
     # So place the base at the world's origin. This is allowed, because A and B do not depend on the
     # position of the base, even in orbit.
-    q = q.copy()
+    q, slow = q.copy(), v.copy()
     q[:3] = 0.0
-    if state.field:
-        by_q, by_v, by_u = aba.slopes(q, v, u)
-        (rates,) = state.velocities(aba.accelerations(q[None], v[None], u[None]))
-        return Dynamics(rates, by_q, by_v, by_u)
-    # Without an orbit, the dynamics do not depend on the linear velocity of the base, except for
-    # the rotation of the base axes, in which the rate of this velocity is -omega x v.
-    slow = v.copy()
-    slow[PIN_LINEAR] = 0.0
+    if not state.field:
+        # Without an orbit, the dynamics do not depend on the linear velocity of the base, except
+        # for the rotation of the base axes, which adds -omega x v to the rate of this velocity.
+        slow[PIN_LINEAR] = 0.0
     by_q, by_v, by_u = aba.slopes(q, slow, u)
     (rates,) = state.velocities(aba.accelerations(q[None], slow[None], u[None]))
-    linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
-    rates[LINEAR] -= np.cross(angular, linear)
-    by_v[:, LINEAR] = 0.0
-    by_v[LINEAR, LINEAR] = -skew(angular)
-    by_v[LINEAR, ANGULAR] += skew(linear)
+    if inertia is not None:
+        residual = inertia @ aba.inverse - np.eye(len(inertia))
+        change = scaled_inverse(inertia) @ residual @ inertia
+        rates, by_u = rates - change @ rates, by_u - change @ by_u
+        # The columns of the base's position and of its linear velocity do not contain M^-1.
+        others = np.r_[ANGULAR, 6 : len(inertia)]
+        by_q[:, others] -= change @ by_q[:, others]
+        by_v[:, others] -= change @ by_v[:, others]
+    if not state.field:
+        linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
+        rates[LINEAR] -= np.cross(angular, linear)
+        by_v[:, LINEAR] = 0.0
+        by_v[LINEAR, LINEAR] = -skew(angular)
+        by_v[LINEAR, ANGULAR] += skew(linear)
     return Dynamics(rates, by_q, by_v, by_u)
 
 
@@ -66,9 +75,8 @@ class Route:
     ----------
     A, B : Reference
         The matrices with their scales and rounding errors.
-    size_A, size_B : ndarray (nx, nx) and (nx, nu)
-        Largest entry of the rows of all velocities, or of all positions, and of the columns of a
-        block.
+    sums_A, sums_B : ndarray (nx, nx) and (nx, nu)
+        Sums of the magnitudes of the terms of A and B, to which rounding errors are relative.
     rates, by_x, by_u : ndarray (6 + n,), (6 + n, nx) and (6 + n, nu)
         Accelerations in base axes, and their derivatives with respect to the state and the inputs.
         Their rounding errors are `rates_error`, `by_x_error` and `by_u_error`.
@@ -100,7 +108,8 @@ class Route:
         # To sample the rounding errors, the derivatives are computed again at points that differ by
         # a few units in the last place, and with M^-1 of CRBA in place of ABA's M^-1.
         found = _dynamics(self.aba, self.q, self.v, self._u)
-        others = [self._corrected(found, _in_base(state, self.q, inverse))]
+        inertia = _in_base(state, self.q, self.M)
+        others = [_dynamics(self.aba, self.q, self.v, self._u, inertia)]
         rng = np.random.default_rng(0)
         others += [_dynamics(self.aba, *self._nudged(rng)) for _ in range(_SAMPLES)]
         self.at = self._own.jacobians(self.q, self.nu, self._u, found.rates)
@@ -135,37 +144,28 @@ class Route:
         sums_A, sums_B = self._sums(found)
         # The derivatives of the accelerations are sums of entries of M^-1 times derivatives of
         # generalised forces.
-        size = np.abs(inverse)
-        terms_A = np.vstack((sums_A[:nv], size @ np.abs(self.M @ A[nv:])))
-        terms_B = np.vstack((sums_B[:nv], size @ np.abs(self.M @ B[nv:])))
+        weights = np.abs(inverse)
+        terms_A = np.vstack((sums_A[:nv], weights @ np.abs(self.M @ A[nv:])))
+        terms_B = np.vstack((sums_B[:nv], weights @ np.abs(self.M @ B[nv:])))
         # Rounding errors of the model's constants, such as the placements of joints, do not change
-        # with the operating point. They are relative to the largest derivatives of accelerations.
-        halves = {"positions": slice(nv), "velocities": slice(nv, 2 * nv)}
+        # with the operating point. They change the entries of M, relative to these entries.
+        sums_A[nv:] += weights @ (np.abs(self.M) @ np.abs(A[nv:]))
+        sums_B[nv:] += weights @ (np.abs(self.M) @ np.abs(lower))
+        self.sums_A, self.sums_B = sums_A, sums_B
         units, input_units = self.units, 1.0 / self.input_mobility
-        self.size_A = block_sizes(halves, groups, A, units, units)
-        self.size_B = block_sizes(halves, inputs, B, units, input_units)
-        scale = scales(groups, groups, A, terms_A, units, units)
-        rounding = FEW_ULPS * EPS * (sums_A + self.size_A)
+        size = np.maximum(spread_over(groups, A, units), terms_A)
+        scale = scales(groups, groups, size, units, units)
+        rounding = FEW_ULPS * EPS * sums_A
         rounding += sampled(groups, A, [x for x, _ in more], units)
         self.A = Reference(A, scale, rounding)
-        scale = scales(groups, inputs, B, terms_B, units, input_units)
-        rounding = FEW_ULPS * EPS * (sums_B + self.size_B)
+        size = np.maximum(spread_over(groups, B, units), terms_B)
+        scale = scales(groups, inputs, size, units, input_units)
+        rounding = FEW_ULPS * EPS * sums_B
         rounding += sampled(groups, B, [x for _, x in more], units)
         self.B = Reference(B, scale, rounding)
 
     def _assembled(self, found: Dynamics) -> tuple[Array, Array]:
         return _assembled(self._own, self.q, self.nu, self._u, found)
-
-    def _corrected(self, found: Dynamics, inverse: Array) -> Dynamics:
-        """Return the dynamics with another M^-1 than the one that ABA computed last.
-
-        `inverse` is M^-1 in base axes. If links are far apart, ABA is less accurate than the
-        composite-rigid-body algorithm.
-        """
-        M = _in_base(self.state, self.q, self.M)
-        residual = M @ self.aba.inverse - np.eye(len(M))
-        change = inverse @ residual @ M
-        return Dynamics(*(part - change @ part for part in found))
 
     def _nudged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return q, v and the inputs in base axes, changed by a few units in the last place."""

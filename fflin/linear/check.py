@@ -31,6 +31,7 @@ from fflin.linear.scales import (
     Row,
     sampled,
     scales,
+    spread_over,
     worst,
 )
 from fflin.robot.outputs import FullState
@@ -51,7 +52,7 @@ class Check:
     Attributes
     ----------
     rows : tuple of Row
-        One row per comparison of a block of A or B, with its error and tolerance.
+        One row per comparison of a block of A, B, C or D, with its error and tolerance.
     title : str
         Description of the checked model.
 
@@ -127,8 +128,13 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     - sixth-order central differences of the nonlinear model :math:`\dot x = f(x, u)` in the same
       chart (relative tolerance 1e-8). The function f is itself verified against integrated motions.
 
-    For an ill-conditioned inertia matrix M, the tolerances are larger, because round-off errors
-    grow with the condition number of M.
+    C and D are compared with finite differences of the outputs, combined with the ABA derivatives
+    (relative tolerance 1e-9).
+
+    The error of an entry is relative to its scale (4.10): the largest entry of its column in the
+    block, or the terms that cancel in the entry. The scale does not depend on units. If M is
+    ill-conditioned, the scale is larger, because it includes the rounding errors of the independent
+    computations.
 
     Parameters
     ----------
@@ -210,6 +216,13 @@ class References:
             # Large steps are accurate, because the kinematics consist of sines and cosines.
             steps = self._steps(lin, joints=0.03, modes=0.1)[: len(lin.x0)]
             self._outputs = OutputReference(self._model, self.route, lin, steps)
+
+    def matrices(self) -> dict[str, Reference]:
+        """Return A and B by ABA, and C and D if the output is not the state."""
+        found = {"A": self.route.A, "B": self.route.B}
+        if self._outputs is not None:
+            found |= {"C": self._outputs.C, "D": self._outputs.D}
+        return found
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare a model that has this operating point."""
@@ -301,7 +314,7 @@ class References:
         still = np.abs(slopes) @ np.abs(self._point)
         size = np.tile((still + route.rate_terms(np.zeros(nv)))[:, None], len(steps))
         size[:, nv:nx] = (still + route.rate_terms(steps[nv:nx]))[:, None]
-        size = size / steps + np.hstack((route.size_A, route.size_B))
+        size = size / steps + np.hstack((route.sums_A, route.sums_B))
         rounding = ULPS * EPS * size
         rounding += sampled(g._asdict(), slopes, [again], route.units)
         return (
@@ -316,7 +329,9 @@ class References:
         terms = route.rate_terms(np.zeros(len(route.M)))[:, None]
         units = route.units
         columns = {"f0": slice(1)}
-        scale = scales(route.state.groups._asdict(), columns, f0, terms, units, np.ones(1))
+        groups = route.state.groups._asdict()
+        size = np.maximum(spread_over(groups, f0, units), terms)
+        scale = scales(groups, columns, size, units, np.ones(1))
         nv = len(route.M)
         error = route.frame_size @ np.append(np.zeros(nv), route.rates_error)
         return Reference(f0, scale, error[:, None])

@@ -19,10 +19,12 @@ from fflin.linear.scales import (
     EPS,
     FEW_ULPS,
     ROUTE_TOLERANCE,
+    Blocks,
     Reference,
     Row,
-    block_scales,
+    block_sizes,
     sampled,
+    scales,
     spread_over,
     worst,
 )
@@ -49,26 +51,31 @@ class OutputReference:
         y0 = self._measuring(lin.x0, lin.q, route.v, self._a)[:, None]
         by_x, rounding, sizes = self._kinematics(steps)
         by_a = self._by_acceleration()
-        size, ones, nv = np.abs(by_a), np.ones(len(y0)), len(route.M)
+        size, nv = np.abs(by_a), len(route.M)
         C, D = by_x + by_a @ route.by_x, by_a @ route.by_u
         halves = {"positions": slice(nv), "velocities": slice(nv, 2 * nv)}
         terms = np.abs(by_x) + size @ np.abs(route.by_x)
-        scale = block_scales(self._vectors, halves, C, terms, ones, route.units)
-        self._C = Reference(C, scale, rounding + size @ route.by_x_error)
+        scale = self._scale(C, terms, halves, route.units)
+        self.C = Reference(C, scale, rounding + size @ route.by_x_error)
         inputs, units = route.aba.actuation.groups, 1.0 / route.input_mobility
-        terms = size @ np.abs(route.by_u)
-        scale = block_scales(self._vectors, inputs, D, terms, ones, units)
-        self._D = Reference(D, scale, size @ route.by_u_error)
-        sizes = (sizes + size @ np.abs(route.state.velocities(self._a)))[:, None]
-        scale = block_scales(self._vectors, {"y0": slice(1)}, y0, sizes, ones, np.ones(1))
+        scale = self._scale(D, size @ np.abs(route.by_u), inputs, units)
+        self.D = Reference(D, scale, size @ route.by_u_error)
+        terms = (sizes + size @ np.abs(route.state.velocities(self._a)))[:, None]
+        scale = self._scale(y0, terms, {"y0": slice(1)}, np.ones(1))
         self._y0 = Reference(y0, scale, (size @ route.rates_error)[:, None])
+
+    def _scale(self, x: Array, terms: Array, columns: Blocks, units: Array) -> Array:
+        """Return the scales of a matrix: the largest entry of the block, or the terms."""
+        ones = np.ones(len(x))
+        size = np.maximum(block_sizes(self._vectors, columns, x, ones, units), terms)
+        return scales(self._vectors, columns, size, ones, units)
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare y0, C and D of a model, with one row for each type of output."""
         for name, reference, given in (
             ("y0", self._y0, lin.y0[:, None]),
-            ("C", self._C, lin.C),
-            ("D", self._D, lin.D),
+            ("C", self.C, lin.C),
+            ("D", self.D, lin.D),
         ):
             errors = reference.errors(given, ROUTE_TOLERANCE)
             for word, rows in self._kinds.items():

@@ -51,15 +51,18 @@ class Reference(NamedTuple):
     scale: Array
     rounding: Array
 
-    def errors(self, given: Array, tolerance: float) -> Array:
-        """Return the relative error of each entry of a given matrix.
+    def scales(self, tolerance: float) -> Array:
+        """Return the scale of each entry for errors with this tolerance.
 
-        If the rounding error of the reference exceeds the tolerance, the error is relative to the
-        rounding error divided by the tolerance. So rounding errors alone do not exceed the
-        tolerance.
+        If the rounding error of an entry exceeds the tolerance, the scale is the rounding error
+        divided by the tolerance. So rounding errors alone do not exceed the tolerance.
         """
-        scale = np.maximum(self.scale, self.rounding / tolerance)
-        errors: Array = np.abs(given - self.value) / scale
+        scales: Array = np.maximum(self.scale, self.rounding / tolerance)
+        return scales
+
+    def errors(self, given: Array, tolerance: float) -> Array:
+        """Return the error of each entry of a given matrix, divided by its scale."""
+        errors: Array = np.abs(given - self.value) / self.scales(tolerance)
         return errors
 
 
@@ -75,36 +78,13 @@ def spread_over(rows: Blocks, x: Array, row_units: Array) -> Array:
     return found
 
 
-def scales(
-    rows: Blocks, columns: Blocks, x: Array, terms: Array, row_units: Array, column_units: Array
-) -> Array:
-    """Return the scale of each entry of a reference matrix x, whose terms have these magnitudes.
-
-    The scale is the larger of the terms of the entry and of the largest entry of its column in the
-    same block. If both are zero, it is the largest entry of the block. If the block is zero, the
-    scale is one unit.
-    """
-    by_column = np.maximum(spread_over(rows, x, row_units), terms)
-    by_block = block_scales(rows, columns, x, terms, row_units, column_units)
-    return np.where(by_column > 0.0, by_column, by_block)
-
-
-def block_scales(
-    rows: Blocks, columns: Blocks, x: Array, terms: Array, row_units: Array, column_units: Array
-) -> Array:
-    """Return a common scale for all entries of each block, in the units of its rows and columns.
-
-    The scale is the largest entry and the largest term of the block, or one unit if the block is
-    zero.
-    """
-    size = block_sizes(rows, columns, np.maximum(np.abs(x), terms), row_units, column_units)
-    return np.where(size > 0.0, size, np.outer(row_units, 1.0 / column_units))
-
-
 def block_sizes(
     rows: Blocks, columns: Blocks, x: Array, row_units: Array, column_units: Array
 ) -> Array:
-    """Return the largest magnitude in each block, in the units of its rows and columns."""
+    """Return, for each entry of x, the largest magnitude in its block.
+
+    The magnitude is converted to the units of the row and the column of the entry.
+    """
     units = np.outer(row_units, 1.0 / column_units)
     sizes = np.abs(x) / units
     for row in rows.values():
@@ -112,6 +92,19 @@ def block_sizes(
             where = np.ix_(np.arange(len(x))[row], np.arange(x.shape[1])[column])
             sizes[where] = sizes[where].max(initial=0.0)
     return sizes * units
+
+
+def scales(
+    rows: Blocks, columns: Blocks, sizes: Array, row_units: Array, column_units: Array
+) -> Array:
+    """Return the scale of each entry of a matrix from its size.
+
+    The scale is the size. If the size is zero, the scale is the largest size in the block. If the
+    block is zero, the scale is one unit.
+    """
+    largest = block_sizes(rows, columns, sizes, row_units, column_units)
+    unit = np.outer(row_units, 1.0 / column_units)
+    return np.where(sizes > 0.0, sizes, np.where(largest > 0.0, largest, unit))
 
 
 def sampled(rows: Blocks, value: Array, others: Sequence[Array], row_units: Array) -> Array:
