@@ -18,9 +18,9 @@ from fflin.linear.scales import EPS, FEW_ULPS, Reference, sampled, scales, sprea
 from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
-# Relative change of the operating point, for which the ABA derivatives are computed again to sample
-# their rounding errors. It is a few ulp, so it changes the exact derivatives by no more than their
-# rounding errors.
+# To sample their rounding errors, the ABA derivatives are computed again at _SAMPLES points that
+# differ by _NUDGE. This changes the exact derivatives by no more than some ten units in the last
+# place of the arguments do.
 _NUDGE, _SAMPLES = 1e-14, 3
 
 
@@ -68,6 +68,14 @@ def _dynamics(aba: Aba, q: Array, v: Array, u: Array, inertia: Array | None = No
     return Dynamics(rates, by_q, by_v, by_u)
 
 
+class Accelerations(NamedTuple):
+    """Accelerations (6 + n,) in base axes, and their derivatives by the state and the inputs."""
+
+    rates: Array
+    by_x: Array
+    by_u: Array
+
+
 class Route:
     """A and B by the derivatives of ABA at the point of a model.
 
@@ -77,9 +85,12 @@ class Route:
         The matrices with their scales and rounding errors.
     sums_A, sums_B : ndarray (nx, nx) and (nx, nu)
         Sums of the magnitudes of the terms of A and B, to which rounding errors are relative.
-    rates, by_x, by_u : ndarray (6 + n,), (6 + n, nx) and (6 + n, nu)
-        Accelerations in base axes, and their derivatives with respect to the state and the inputs.
-        Their rounding errors are `rates_error`, `by_x_error` and `by_u_error`.
+    accelerations : Accelerations
+        Accelerations and their derivatives.
+    samples : list of Accelerations
+        The same with other rounding errors.
+    rates_error : ndarray (6 + n,)
+        Rounding errors of the accelerations.
     mobility, base_mobility : ndarray (6 + n,)
         Mobilities sqrt((M^-1)_ii) in the axes of the frame and of the base: the speed of coordinate
         i at a kinetic energy of 1/2 J, if all other coordinates are free. They make accelerations
@@ -106,7 +117,7 @@ class Route:
         self.units = np.concatenate((self.mobility, self.mobility))
 
         # To sample the rounding errors, the derivatives are computed again at points that differ by
-        # a few units in the last place, and with M^-1 of CRBA in place of ABA's M^-1.
+        # _NUDGE, and with M^-1 of CRBA in place of ABA's M^-1.
         found = _dynamics(self.aba, self.q, self.v, self._u)
         inertia = _in_base(state, self.q, self.M)
         others = [_dynamics(self.aba, self.q, self.v, self._u, inertia)]
@@ -118,20 +129,15 @@ class Route:
         self._matrices(found, others, inverse)
 
     def _accelerations(self, found: Dynamics, others: list[Dynamics]) -> None:
+        self.accelerations = self._by_state(found)
+        self.samples = [self._by_state(other) for other in others]
         parts = {"omega_b": ANGULAR, "v_b": LINEAR, "qdot_m": slice(6, None)}
-        units = self.base_mobility
-        by_x, by_u = self._by_state(found)
-        more = [self._by_state(other) for other in others]
-        rates = [other.rates[:, None] for other in others]
-        self.rates, self.by_x, self.by_u = found.rates, by_x, by_u
-        self.rates_error = sampled(parts, found.rates[:, None], rates, units)[:, 0]
-        self.by_x_error = sampled(parts, by_x, [x for x, _ in more], units)
-        self.by_u_error = sampled(parts, by_u, [u for _, u in more], units)
+        rates = [other.rates[:, None] for other in self.samples]
+        self.rates_error = sampled(parts, found.rates[:, None], rates, self.base_mobility)[:, 0]
 
-    def _by_state(self, found: Dynamics) -> tuple[Array, Array]:
-        """Return the derivatives of the accelerations by the state and by the inputs."""
+    def _by_state(self, found: Dynamics) -> Accelerations:
         by_y = np.hstack((found.by_q, found.by_v)) + found.by_u @ self.at.H
-        return by_y @ self.at.left, found.by_u @ self.at.V
+        return Accelerations(found.rates, by_y @ self.at.left, found.by_u @ self.at.V)
 
     def _matrices(self, found: Dynamics, others: list[Dynamics], inverse: Array) -> None:
         groups, inputs, nv = self.state.groups._asdict(), self.aba.actuation.groups, len(self.M)
@@ -168,7 +174,7 @@ class Route:
         return _assembled(self._own, self.q, self.nu, self._u, found)
 
     def _nudged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Return q, v and the inputs in base axes, changed by a few units in the last place."""
+        """Return q, v and the inputs in base axes, changed by _NUDGE."""
         state, scales = self.state, [joint.scale for joint in self.state.robot.joints]
         size = np.concatenate((np.ones(6), scales))
         step = state.spread(_NUDGE * rng.choice((-1.0, 1.0), len(size)) / size)

@@ -295,7 +295,10 @@ class References:
         steps[g.omega_b] = 0.1 * fastest
         steps[g.qdot_m] = 0.1 * fastest * per_unit
         steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
-        steps[nx:] = max(1.0, _largest(route.rates / route.base_mobility)) / route.input_mobility
+        steps[nx:] = (
+            max(1.0, _largest(route.accelerations.rates / route.base_mobility))
+            / route.input_mobility
+        )
         return steps
 
     def _by_differences(self, lin: LinearModel) -> tuple[Reference, Reference]:

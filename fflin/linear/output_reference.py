@@ -50,19 +50,25 @@ class OutputReference:
 
         y0 = self._measuring(lin.x0, lin.q, route.v, self._a)[:, None]
         by_x, rounding, sizes = self._kinematics(steps)
-        by_a = self._by_acceleration()
-        size, nv = np.abs(by_a), len(route.M)
-        C, D = by_x + by_a @ route.by_x, by_a @ route.by_u
+        by_a, at = self._by_acceleration(), route.accelerations
+        size, nv, ones = np.abs(by_a), len(route.M), np.ones(len(y0))
+        C, D = by_x + by_a @ at.by_x, by_a @ at.by_u
+
+        def sampled_errors(x: Array, others: list[Array]) -> Array:
+            return sampled(self._vectors, x, others, ones)
+
         halves = {"positions": slice(nv), "velocities": slice(nv, 2 * nv)}
-        terms = np.abs(by_x) + size @ np.abs(route.by_x)
-        scale = self._scale(C, terms, halves, route.units)
-        self.C = Reference(C, scale, rounding + size @ route.by_x_error)
+        scale = self._scale(C, np.abs(by_x) + size @ np.abs(at.by_x), halves, route.units)
+        rounding += sampled_errors(C, [by_x + by_a @ other.by_x for other in route.samples])
+        self.C = Reference(C, scale, rounding)
         inputs, units = route.aba.actuation.groups, 1.0 / route.input_mobility
-        scale = self._scale(D, size @ np.abs(route.by_u), inputs, units)
-        self.D = Reference(D, scale, size @ route.by_u_error)
-        terms = (sizes + size @ np.abs(route.state.velocities(self._a)))[:, None]
+        scale = self._scale(D, size @ np.abs(at.by_u), inputs, units)
+        self.D = Reference(D, scale, sampled_errors(D, [by_a @ x.by_u for x in route.samples]))
+        rates = np.abs(route.state.velocities(self._a))
+        terms = (sizes + size @ rates)[:, None]
         scale = self._scale(y0, terms, {"y0": slice(1)}, np.ones(1))
-        self._y0 = Reference(y0, scale, (size @ route.rates_error)[:, None])
+        others = [y0 + (by_a @ (x.rates - at.rates))[:, None] for x in route.samples]
+        self._y0 = Reference(y0, scale, sampled_errors(y0, others))
 
     def _scale(self, x: Array, terms: Array, columns: Blocks, units: Array) -> Array:
         """Return the scales of a matrix: the largest entry of the block, or the terms."""
@@ -124,7 +130,9 @@ class OutputReference:
     def _by_acceleration(self) -> Array:
         """Return dh/da (ny, 6 + n); h is linear in the acceleration a."""
         state, lin, v = self._route.state, self._lin, self._route.v
+        # The steps are as large as the accelerations, so that rounding errors of h are small.
         units = self._route.base_mobility
+        units = units * max(1.0, float((np.abs(self._route.accelerations.rates) / units).max()))
         by_a: Array = np.zeros((len(lin.y0), len(units)))
         if not any(output.FEELS_ACCELERATION for output in state.robot.outputs):
             return by_a
