@@ -32,13 +32,12 @@ class Nonlinear:
     def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
         self._aba, self._lin = aba, lin
         self.state = state or aba.state
-        # Without an orbit, ABA receives positions and velocities relative to an observer. The
-        # observer is where the base is at the operating point, and moves with its velocity there.
-        # Otherwise, rounding errors of a distant or fast base would hide everything else.
-        self._observer, self._home = np.zeros((2, 3))
+        # Without an orbit, ABA receives velocities relative to an observer. The observer moves with
+        # the velocity that the base has at the operating point. Otherwise, rounding errors of the
+        # velocity of a fast base would hide the other velocities.
+        self._observer = np.zeros(3)
         if aba.field is None:
             self._observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
-            self._home = lin.q[:3]
         # Velocity and acceleration of a moving reference; zero for a fixed reference.
         self._v: Array = np.zeros((1, aba.state.robot.nv))
         self._a: Array = np.zeros_like(self._v)
@@ -55,9 +54,7 @@ class Nonlinear:
         observer = self._observer @ rotation_matrices(q[:, 3:7])
         relative = v.copy()
         relative[:, PIN_LINEAR] -= observer
-        near = q.copy()
-        near[:, :3] -= self._home
-        a = self._aba.accelerations(near, relative, self._aba.actuation.in_base_axes(chart, u))
+        a = self._aba.accelerations(q, relative, self._aba.actuation.in_base_axes(chart, u))
         a[:, PIN_LINEAR] -= np.cross(v[:, PIN_ANGULAR], observer)
         return chart, q, v, a
 

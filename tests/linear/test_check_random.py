@@ -33,9 +33,11 @@ class Sizes:
         self.inputs = 1.0 / np.where(per_input > 0.0, per_input, 1.0)
         forces = np.abs(M @ lin.A[nv:])
         # Gravity and the acceleration of a robot in free fall cancel, and so do the terms with the
-        # angular velocity of an orbit.
+        # angular velocity of an orbit. A base rotation turns the weight, and a joint moves it.
         gravity = np.linalg.norm(case.robot.gravity)
         forces[:, :3] += gravity * np.abs(M[:, 3:6]).max(axis=1, keepdims=True)
+        moving = np.r_[0:3, 6:nv]
+        forces[moving, 6:nv] += gravity * np.abs(M[3:6, 6:]).max(axis=0)
         if case.robot.orbit:
             turning = forces[:, nv : nv + 3].max(axis=1, keepdims=True)
             forces[:, :3] += 2.0 * case.robot.orbit.mean_motion * turning
@@ -59,7 +61,10 @@ class Sizes:
         # Some blocks are zero, or only rounding errors. Their scale is the scale of the check.
         if size <= self.largest(name, reference.rounding, *where[2:]):
             return self.largest(name, reference.scales(1e-9), *where[2:])
-        return max(size, self.terms[name][at]) if name in self.terms else size
+        # The terms of C are the derivatives of the kinematics and of the accelerations. They cancel
+        # for an accelerometer in free fall.
+        terms = self.terms.get(name, reference.scale)
+        return max(size, terms[at])
 
 
 def vectors(lin):
