@@ -9,6 +9,16 @@ from fflin.dynamics.coordinates import PIN_ANGULAR
 from fflin.dynamics.state import Actuation, StateMap
 
 
+def scaled_inverse(matrix: Array) -> Array:
+    """Return the inverse of a symmetric positive definite matrix, scaled to a unit diagonal.
+
+    Without the scaling, a matrix of coordinates of very different inertia would lose digits.
+    """
+    scale = 1.0 / np.sqrt(np.diagonal(matrix))
+    found: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
+    return found
+
+
 class Aba:
     """Nonlinear dynamics of a robot with all its forces; base velocities are in base axes."""
 
@@ -149,7 +159,7 @@ class Aba:
         # Mimic joints: solve S^T M S nudot = S^T (tau - b) with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))
         bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
-        return state.spread(np.linalg.solve(M, forces - state.forces(bias)))
+        return state.spread(scaled_inverse(M) @ (forces - state.forces(bias)))
 
     def _constrained_derivatives(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
@@ -170,8 +180,8 @@ class Aba:
         for joint, leader, *_ in state.robot.followers:
             rotor[[joint.idx_v, leader.idx_v]] = shared[leader.idx_v]
         model.armature = model.armature + rotor
-        with_rotor = np.linalg.inv(pin.computeMinverse(model, data, q))
-        by_force = np.linalg.inv(S.T @ with_rotor @ S - (S.T * rotor) @ S)
+        with_rotor = scaled_inverse(pin.computeMinverse(model, data, q))
+        by_force = scaled_inverse(S.T @ with_rotor @ S - (S.T * rotor) @ S)
         to_independent = by_force @ S.T @ with_rotor
         free = pin.aba(model, data, q, v, tau, external)
         in_step = tau + with_rotor @ (S @ (to_independent @ free) - free)
