@@ -320,7 +320,9 @@ class Measuring:
         pin.forwardKinematics(self.model, self.data, q)
         frames = [[find_frame(self.model, x) for x in output.frames] for output in robot.outputs]
         attitudes = [[np.array(self.placement(f).rotation) for f in group] for group in frames]
-        self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
+        # Indices of the states that make up an output; empty for outputs in `KINDS`.
+        states = [[] if type(x) in KINDS else state_indices(state, x) for x in robot.outputs]
+        self._outputs = tuple(zip(robot.outputs, frames, attitudes, states, strict=True))
 
     def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
         """Return y (ny,) at a point, which is given as the state x and also as q and v.
@@ -332,8 +334,8 @@ class Measuring:
             [
                 KINDS[type(output)][1](self, attitudes, *frames)
                 if type(output) in KINDS
-                else x[state_indices(self.state, output)]
-                for output, frames, attitudes in self._outputs
+                else x[states]
+                for output, frames, attitudes, states in self._outputs
             ]
         )
 
