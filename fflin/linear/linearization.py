@@ -16,7 +16,8 @@ from fflin.dynamics.coordinates import Chart, Frame, Standing, refuse_orbit
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.linear.check import certify, inertia_matrix
+from fflin.linear.aba_route import inertia_matrix
+from fflin.linear.check import certify
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
 from fflin.robot.fields import magnitudes_of

@@ -43,7 +43,7 @@ class Certificate:
         Largest entry of M M^-1 - I, where M is scaled to a unit diagonal.
     route_A, route_B : float
         Largest difference between A (or B) and the matrix that follows from Pinocchio's ABA
-        derivatives, relative to the largest entry of the same block.
+        derivatives, relative to the scale of the entry; see `check`.
     f0 : float
         Largest entry of the state derivative at the operating point; 0 at a fixed point.
 

@@ -22,7 +22,7 @@ from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
 from fflin.dynamics.state import StateMap
-from fflin.linear.check import aba_route
+from fflin.linear.aba_route import aba_route
 from fflin.linear.linearization import Prepared, own_reference
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, output_equations

@@ -7,7 +7,7 @@ import pytest
 import fflin
 from fflin.batch.sweep import ChunkJob
 from fflin.dynamics.rnea import Inertia
-from fflin.linear.check import inertia_matrix
+from fflin.linear.aba_route import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
 
 pytestmark = pytest.mark.compiled

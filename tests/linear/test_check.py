@@ -1,4 +1,7 @@
-"""`check` must be able to fail: an error planted in any block is found, by both routes."""
+"""`check` must be able to fail: an error planted in any block is found, by both routes.
+
+Errors of random robots are in test_check_random.py.
+"""
 
 from dataclasses import replace
 
@@ -7,6 +10,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.linear.aba_route import Route
+from tests.support.random_robots import random_case
 from tests.support.robots import random_point, random_pose
 
 GROUPS = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
@@ -200,3 +205,139 @@ def test_a_tolerance_takes_the_place_of_every_figures_own():
     for wrong in (0.0, -1e-6, 1.0, np.nan, np.inf, "much", True):
         with pytest.raises(fflin.InputError, match="tolerance"):
             fflin.check(robot, lin, tolerance=wrong)
+
+
+def test_a_weak_mode_is_verified():
+    """A unit amplitude of the second mode turns its body by 1,170 rad, so its step is small."""
+    array = fflin.FlexibleAppendage(
+        "panel_left_1",
+        [0.25, 1.1],
+        [[0, 0], [0, 0], [2.71, 5e-4]],
+        [[4.27, 0], [0, 8.55e-4], [0, 0]],
+    )
+    robot = fflin.load("inspector", lock=["hinge_*"], appendages=[array])
+    assert fflin.check(robot, fflin.linearize(robot)).ok
+
+
+def test_the_momentum_of_a_weak_mode_is_not_lost_in_the_momentum_of_the_robot():
+    """A unit amplitude of the mode moves the centre of mass of 350 kg by 3e-9 m."""
+    array = fflin.FlexibleAppendage("panel_left_1", 0.3, [[0], [0], [1e-6]], [[1e-6], [0], [0]])
+    robot = fflin.load("inspector", lock=["hinge_*"], appendages=[array])
+    robot = robot.replace(outputs=[fflin.CenterOfMass(), fflin.Momentum()])
+    q, v, _ = random_point(robot, np.random.default_rng(7), degrees=20.0)
+    mode = robot.joint("panel_left_1_mode_1")
+    mode.place(q, 0.2 / mode.scale)
+    v[mode.idx_v] = 0.3
+    lin = fflin.linearize(robot, q, v)
+    assert fflin.check(robot, lin).ok
+    # The scale of a row of C is the displacement or momentum for a unit of energy.
+    mobility = np.sqrt(np.linalg.inv(lin.M).diagonal())
+    column = lin.state_names.index(f"q_m.{mode.name}")
+    for row in (1, 4, 7):
+        C = lin.C.copy()
+        C[row, column] += 1e-6 * np.abs(C[row, : len(mobility)] * mobility).max()
+        assert not fflin.check(robot, replace(lin, C=C)).ok
+
+
+def falling(frame="base"):
+    gravity = (0.0, 0.0, -9.81)
+    return fflin.load("servicer_7dof", gravity=gravity, outputs=[fflin.Accelerometer(frame)])
+
+
+@pytest.mark.parametrize("frame", ["base", "tool"])
+def test_an_accelerometer_in_free_fall_is_verified(frame):
+    robot = falling(frame)
+    lin = fflin.linearize(robot)
+    found = fflin.check(robot, lin)
+    assert found.ok
+    assert str(found).startswith("A, B, C and D are verified: largest error")
+    # An error of 1e-8 of gravity, which cancels in C, is found.
+    C = lin.C.copy()
+    C[1, 0] += 1e-8 * 9.81
+    assert not fflin.check(robot, replace(lin, C=C)).ok
+
+
+def test_the_headline_names_the_block_that_failed():
+    robot = falling()
+    lin = fflin.linearize(robot)
+    C, A = lin.C.copy(), lin.A.copy()
+    C[1, 0] += 1e-3
+    A[13, 7] += 1e-3
+    found = fflin.check(robot, replace(lin, C=C))
+    assert str(found).startswith("C (accelerometer) is not verified: 1 of 123 comparisons FAILED")
+    found = fflin.check(robot, replace(lin, A=A, C=C))
+    first = " ".join(str(found).split("\n\n")[0].split())
+    assert first == (
+        "A[r_b, q_m] (ABA derivatives, differences), C (accelerometer) are not verified: "
+        "3 of 123 comparisons FAILED"
+    ).replace("r_b, q_m", "q_m, q_m")
+
+
+def scaled(robot, length, mass):
+    """The same robot in other units of length and mass; its joints must be revolute."""
+    model = robot.model.copy()
+    for k, body in enumerate(model.inertias.tolist()):
+        model.inertias[k] = pin.Inertia(
+            mass * body.mass, length * body.lever, mass * length**2 * body.inertia
+        )
+        place = model.jointPlacements[k]
+        model.jointPlacements[k] = pin.SE3(place.rotation, length * place.translation)
+    return fflin.from_model(model, name="scaled")
+
+
+def test_errors_do_not_depend_on_units():
+    """An error of 1 % of an entry has the same size in m and kg as in mm and t."""
+    robot = fflin.load("servicer_7dof")
+    q, v, _ = random_point(robot, np.random.default_rng(5), degrees=40.0)
+    errors = []
+    for length, mass in ((1.0, 1.0), (1e3, 1e-3), (1e-2, 30.0)):
+        other = scaled(robot, length, mass)
+        at_q, at_v = q.copy(), v.copy()
+        at_q[:3] *= length
+        at_v[:3] *= length
+        lin = fflin.linearize(other, at_q, at_v)
+        A, B = lin.A.copy(), lin.B.copy()
+        A[lin.A.shape[0] // 2 :] *= 1.01
+        B *= 1.01
+        found = fflin.check(other, replace(lin, A=A, B=B))
+        errors.append({r.block: r.error for r in found.rows if r.test == "ABA derivatives"})
+    planted = [block for block, error in errors[0].items() if error > 1e-6]
+    assert len(planted) > 12
+    for other in errors[1:]:
+        for block in planted:
+            assert other[block] == pytest.approx(errors[0][block], rel=1e-6), block
+
+
+def test_a_larger_error_does_not_loosen_the_check():
+    """The scales come from the independent computations alone."""
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot, *random_point(robot, np.random.default_rng(6)))
+    errors = []
+    for factor in (1e-3, 1e9):
+        A, B = lin.A.copy(), lin.B.copy()
+        A[-1, -1] += factor
+        B[-1, -1] += factor
+        rows = fflin.check(robot, replace(lin, A=A, B=B)).rows
+        blocks = "A[qdot_m, qdot_m]", "B[qdot_m, tau_m]"
+        errors.append([row.error for row in rows if row.block in blocks])
+    assert np.array(errors[1]) == pytest.approx(1e12 * np.array(errors[0]), rel=1e-6)
+
+
+def test_a_robot_far_from_the_origin_is_verified():
+    robot = fflin.load("dual_arm")
+    q, v, u = random_point(robot, np.random.default_rng(8))
+    q[:3] = 4e6, -2e6, 5e6
+    lin = fflin.linearize(robot, q, v, u, reference=pin.SE3(np.eye(3), q[:3].copy()))
+    assert fflin.check(robot, lin).ok
+
+
+@pytest.mark.parametrize("seed", [42, 135, 293])
+def test_aba_of_light_links_with_mimic_joints_is_accurate(seed):
+    """The inertias differ by up to 1e10. Without scaling, the inverse would lose three digits."""
+    case = random_case(seed)
+    assert case.robot.followers
+    lin = case.linearize()
+    route = Route(case.robot, lin)
+    rows = slice(len(route.M), None)
+    units = np.outer(route.mobility, route.input_mobility)
+    assert np.abs((route.B.value - lin.B)[rows] / units).max() < 1e-13

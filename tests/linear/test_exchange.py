@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.aba import Aba
-from fflin.linear.check import scaled_condition
+from fflin.linear.aba_route import scaled_condition
 from fflin.linear.tool_coordinates import TOOLS
 from tests.support.robots import (
     BUNDLED,

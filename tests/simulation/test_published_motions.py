@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.dynamics.aba import Aba
-from fflin.linear.check import Nonlinear
+from fflin.linear.nonlinear import Nonlinear
 
 
 def flown(robot, q, v, u, duration):

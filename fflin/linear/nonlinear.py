@@ -1,0 +1,140 @@
+"""Nonlinear model in the coordinates of a linear model, and its finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrices, rotation_matrix
+from fflin.base.validation import Array, Mask
+from fflin.dynamics import coordinates
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart
+from fflin.dynamics.integrators import integrate_rows
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.linear.scales import DIFFERENCE_TOLERANCE, EPS, ULPS
+
+# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. The error of the
+# difference is h^6 f^(7) / 140.
+_WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
+
+
+class Nonlinear:
+    """Nonlinear model ``xdot = f(x, u)`` in the chart of a linear model, computed by ABA.
+
+    If the linear model has a moving reference, x is the error relative to the reference. In this
+    case, f is 0 at the operating point.
+    """
+
+    def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
+        self._aba, self._lin = aba, lin
+        self.state = state or aba.state
+        # Without an orbit, ABA receives velocities relative to an observer. The observer moves with
+        # the velocity that the base has at the operating point. Otherwise, rounding errors of the
+        # velocity of a fast base would hide the other velocities.
+        self._observer = np.zeros(3)
+        if aba.field is None:
+            self._observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
+        # Velocity and acceleration of a moving reference; zero for a fixed reference.
+        self._v: Array = np.zeros((1, aba.state.robot.nv))
+        self._a: Array = np.zeros_like(self._v)
+        if lin.moving:
+            _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
+
+    def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
+        """Return the charts, q, v and dv/dt for rows (N, nx + nu) of states and inputs.
+
+        q, v and dv/dt are in Pinocchio's order.
+        """
+        x, u = np.split(point, [self.state.nx], axis=1)
+        chart, q, v = self.state.points(x)
+        observer = self._observer @ rotation_matrices(q[:, 3:7])
+        relative = v.copy()
+        relative[:, PIN_LINEAR] -= observer
+        a = self._aba.accelerations(q, relative, self._aba.actuation.in_base_axes(chart, u))
+        a[:, PIN_LINEAR] -= np.cross(v[:, PIN_ANGULAR], observer)
+        return chart, q, v, a
+
+    def rates(self, point: Array) -> Array:
+        """Return dx/dt (N, nx) for rows (N, nx + nu) of states and inputs."""
+        state, (chart, _, v, a) = self.state, self.accelerations(point)
+        # The error (5.1) relative to a reference with velocities v* and w* has the derivatives
+        # de/dt = (e0 (w - w*) + e x (w + w*)) / 2 and dr/dt = R_e v - v* - w* x r. Here (e, e0) is
+        # the error quaternion, and R_e is the rotation matrix of the error.
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
+        at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
+        turning = chart.q0 * (angular - at_angular)
+        turning += np.cross(chart.q_b, angular + at_angular)
+        position_rate = coordinates.times(chart.R, linear) - at_linear
+        position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
+        rate = state.velocities(a)
+        if state.axes[1]:
+            # `rate` contains the time derivative of the components of v in base axes, which rotate.
+            # Add w x v to obtain the time derivative of v relative to the reference axes.
+            rate[:, LINEAR] += np.cross(angular, linear)
+        rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
+        joint_rates = state.velocities(v - self._v)[:, 6:]
+        return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
+
+    def flow_error(self) -> float:
+        """Return the relative error of f, compared with differences of x along short motions."""
+        lin, robot = self._lin, self.state.robot
+        reference = pin.SE3(lin.reference.rotation, np.zeros(3))
+        state = StateMap(robot, reference=reference, frame=lin.frame)
+        near = Nonlinear(self._aba, lin, state)
+        # The first row is the operating point. In each other row, one component of the base
+        # velocity is increased by 1.
+        x = np.tile(lin.x0, (7, 1))
+        x[:, state.groups.r_b] = 0.0
+        x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
+        point = np.hstack((x, np.tile(lin.u0, (7, 1))))
+        (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
+        # Evaluate each motion at the times t = +-h, +-2 h and +-3 h.
+        h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
+        t, speeds = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None], np.tile(v, (6, 1))
+        moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
+        after = coordinates.state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
+        # The rates of a moving reference cancel in the errors, but not their rounding errors.
+        rounding = ULPS * EPS * np.abs(after).reshape(6, *x.shape).max(axis=0) / h
+        if lin.moving:  # the first row is also the motion of the reference
+            after = coordinates.moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
+        ahead, behind = after.reshape(2, 3, *x.shape)
+        rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
+        size = np.maximum(1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1))
+        scale = np.maximum(size[:, None], rounding / DIFFERENCE_TOLERANCE)
+        return float((np.abs(expected - rates) / scale).max())
+
+
+# Ratio of the steps of the two differences of `jacobians`.
+_STEP_RATIO = 1.5
+
+
+def jacobians(
+    f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask
+) -> tuple[Array, Array]:
+    """Return the Jacobian of f at a point, computed twice by central differences.
+
+    The second Jacobian has smaller steps than the given ones. The difference between the two shows
+    the truncation error and the rounding error of the first one.
+    """
+    smaller = steps / _STEP_RATIO
+    return jacobian(f, point, steps, is_curved), jacobian(f, point, smaller, is_curved)
+
+
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
+    """Return the Jacobian of f at a point, computed by central differences with the given steps.
+
+    f maps rows of points to rows of values. The mask `is_curved` selects the variables for which
+    sixth-order differences are used. For all other variables, second-order differences are used.
+    """
+    curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
+    offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))
+    first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
+    *near, rest = np.split(first - last, len(curved) * np.arange(1, 4))
+    derivatives: Array = np.empty((rest.shape[1], len(point)))
+    derivatives[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
+    derivatives[:, ~is_curved] = 0.5 * rest.T
+    return derivatives / steps

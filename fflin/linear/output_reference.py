@@ -1,0 +1,235 @@
+"""Independent computation of y0, C and D by finite differences of the kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array, Indices
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.outputs import Measuring, state_indices
+from fflin.dynamics.state import StateMap
+from fflin.linear.aba_route import Route
+from fflin.linear.model import LinearModel
+from fflin.linear.nonlinear import Nonlinear, jacobians
+from fflin.linear.scales import (
+    EPS,
+    FEW_ULPS,
+    ROUTE_TOLERANCE,
+    Blocks,
+    Reference,
+    Row,
+    block_sizes,
+    sampled,
+    scales,
+    spread_over,
+    worst,
+)
+
+
+class OutputReference:
+    """Independent computation of y0, C and D.
+
+    The outputs are y = h(x, a(x, u)), where a is the acceleration. Finite differences of the
+    kinematics h are combined with the ABA derivatives of a: C = dh/dx + dh/da da/dx and
+    D = dh/da da/du. So the accuracy of the differences does not depend on the condition of M.
+
+    `steps` (nx,) are the steps of the finite differences.
+    """
+
+    def __init__(self, model: Nonlinear, route: Route, lin: LinearModel, steps: Array) -> None:
+        self._route, self._lin = route, lin
+        self._measuring = Measuring(route.state, lin.q)
+        self._bodies = _Bodies(route.state, lin.q[:3])
+        self._kinds, self._vectors = _parts(route.state)
+        *_, a = model.accelerations(np.concatenate((lin.x0, lin.u0))[None])
+        self._a = a[0]
+
+        y0 = self._measuring(lin.x0, lin.q, route.v, self._a)[:, None]
+        by_x, rounding, sizes = self._kinematics(steps)
+        by_a, at = self._by_acceleration(), route.accelerations
+        size, nv, ones = np.abs(by_a), len(route.M), np.ones(len(y0))
+        C, D = by_x + by_a @ at.by_x, by_a @ at.by_u
+
+        def sampled_errors(x: Array, others: Sequence[Array]) -> Array:
+            return sampled(self._vectors, x, others, ones)
+
+        halves = {"positions": slice(nv), "velocities": slice(nv, 2 * nv)}
+        scale = self._scale(C, np.abs(by_x) + size @ np.abs(at.by_x), halves, route.units)
+        rounding += sampled_errors(C, [by_x + by_a @ other.by_x for other in route.samples])
+        self.C = Reference(C, scale, rounding)
+        inputs, units = route.aba.actuation.groups, 1.0 / route.input_mobility
+        scale = self._scale(D, size @ np.abs(at.by_u), inputs, units)
+        self.D = Reference(D, scale, sampled_errors(D, [by_a @ x.by_u for x in route.samples]))
+        rates = np.abs(route.state.velocities(self._a))
+        terms = (sizes + size @ rates)[:, None]
+        scale = self._scale(y0, terms, {"y0": slice(1)}, np.ones(1))
+        others = [y0 + (by_a @ (x.rates - at.rates))[:, None] for x in route.samples]
+        self._y0 = Reference(y0, scale, sampled_errors(y0, others))
+
+    def _scale(self, x: Array, terms: Array, columns: Blocks, units: Array) -> Array:
+        """Return the scales of a matrix: the largest entry of the block, or the terms."""
+        ones = np.ones(len(x))
+        size = np.maximum(block_sizes(self._vectors, columns, x, ones, units), terms)
+        return scales(self._vectors, columns, size, ones, units)
+
+    def rows(self, lin: LinearModel) -> Iterator[Row]:
+        """Compare y0, C and D of a model, with one row for each type of output."""
+        for name, reference, given in (
+            ("y0", self._y0, lin.y0[:, None]),
+            ("C", self.C, lin.C),
+            ("D", self.D, lin.D),
+        ):
+            errors = reference.errors(given, ROUTE_TOLERANCE)
+            for word, rows in self._kinds.items():
+                yield worst("outputs", f"{name} ({word})", errors[rows], ROUTE_TOLERANCE)
+
+    def _kinematics(self, steps: Array) -> tuple[Array, Array, Array]:
+        """Return dh/dx, its rounding errors, and the magnitudes (ny,) of the terms of h."""
+        state, lin, x = self._route.state, self._lin, self._lin.x0
+        groups, ny = state.groups, len(lin.y0)
+        is_curved = np.zeros(len(x), dtype=bool)
+        is_curved[groups.q_b] = is_curved[groups.q_m] = True
+        here = self._evaluate(x[None])[0]
+        by_x, again = jacobians(self._evaluate, x, steps, is_curved)
+
+        parts = {k: np.arange(k, k + 3) for k in range(ny, len(here), 3)}
+        vectors, ones = {**self._vectors, **parts}, np.ones(len(here))
+        places = [lin.reference, *state.robot.model.jointPlacements.tolist()]
+        reach = sum(float(np.linalg.norm(place.translation)) for place in places)
+        reach += float(np.linalg.norm(lin.q[:3]))
+        least = {"rad": 1.0, "1": 1.0, "m": reach}
+        sizes = np.abs(here) + np.abs(by_x) @ np.abs(x)
+        sizes[:ny] += [least.get(unit, 0.0) for unit in lin.output_units]
+        sizes = spread_over(vectors, sizes[:, None], ones)
+        # The differences of a vector that does not depend on a variable are exactly zero.
+        depends = spread_over(vectors, np.abs(by_x) + np.abs(again), ones) > 0.0
+        # But the model itself may have rounding errors of the size of h per radian.
+        per_unit = np.zeros(len(x))
+        per_unit[groups.q_b] = 2.0
+        per_unit[groups.r_b] = 1.0 / reach if reach else 0.0
+        per_unit[groups.q_m] = [body.scale for body in state.robot.joints]
+        rounding = FEW_ULPS * EPS * sizes * (depends / steps + per_unit)
+        rounding += sampled(vectors, by_x, [again], ones)
+        total = self._bodies.sums(here, ny, self._kinds, lin.reference.rotation)
+        size = np.abs(total)
+        return total @ by_x, size @ rounding, (size @ sizes)[:, 0]
+
+    def _evaluate(self, x: Array) -> Array:
+        """Return h (N, ny) for states (N, nx), followed by the contributions of the bodies."""
+        _, q, v = self._route.state.points(x)
+        rows = []
+        for point in zip(x, q, v, strict=True):
+            y = self._measuring(*point, self._a)
+            rows.append(np.append(y, self._bodies(self._measuring)))
+        return np.array(rows)
+
+    def _by_acceleration(self) -> Array:
+        """Return dh/da (ny, 6 + n); h is linear in the acceleration a."""
+        state, lin, v = self._route.state, self._lin, self._route.v
+        # The steps are as large as the accelerations, so that rounding errors of h are small.
+        units = self._route.base_mobility
+        units = units * max(1.0, float((np.abs(self._route.accelerations.rates) / units).max()))
+        by_a: Array = np.zeros((len(lin.y0), len(units)))
+        if not any(output.FEELS_ACCELERATION for output in state.robot.outputs):
+            return by_a
+        for k, unit in enumerate(units):
+            step = state.spread(unit * np.eye(len(units))[k])
+            ahead = self._measuring(lin.x0, lin.q, v, self._a + step)
+            behind = self._measuring(lin.x0, lin.q, v, self._a - step)
+            by_a[:, k] = (ahead - behind) / (2.0 * unit)
+        return by_a
+
+
+class _Body(NamedTuple):
+    """Masses, centres of mass and inertias of the bodies, and momenta of wheels, by joint."""
+
+    mass: Array
+    lever: Array
+    inertia: Array
+    stored: Array
+
+
+class _Bodies:
+    """Contributions of the bodies to the centre of mass and to the momentum of a robot.
+
+    The differences of a light body, such as the body of a mode, are lost in a sum over the bodies.
+    So the contributions of the bodies are differentiated first, and then summed. They are three
+    vectors for each body, in world axes and about `home` (3,):
+
+    - the centre of mass, multiplied by the fraction of the robot's mass;
+    - the linear momentum;
+    - the angular momentum.
+    """
+
+    def __init__(self, state: StateMap, home: Array) -> None:
+        robot = state.robot
+        bodies = robot.model.inertias.tolist()
+        self._home, self._total = home, robot.mass
+        stored = np.zeros((len(bodies), 3))
+        for joint, momentum in robot.stored_momentum:
+            stored[joint] += momentum
+        self._body = _Body(
+            np.array([[body.mass] for body in bodies]),
+            np.array([body.lever for body in bodies]),
+            np.array([body.inertia for body in bodies]),
+            stored,
+        )
+        self._summed = any(output.WORD in ("com", "momentum") for output in robot.outputs)
+
+    def __call__(self, measuring: Measuring) -> Array:
+        """Return the contributions at the point that `measuring` evaluated last."""
+        if not self._summed:
+            return np.zeros(0)
+        body, data = self._body, measuring.data
+        R = np.array([place.rotation for place in data.oMi.tolist()])
+        origin = np.array([place.translation for place in data.oMi.tolist()])
+        twist = np.array([motion.vector for motion in data.v.tolist()])
+        omega = twist[:, PIN_ANGULAR]
+        speed = twist[:, PIN_LINEAR] + np.cross(omega, body.lever)
+        spin = (body.inertia @ omega[..., None])[..., 0] + body.stored
+        center = origin - self._home + (R @ body.lever[..., None])[..., 0]
+        momentum = body.mass * (R @ speed[..., None])[..., 0]
+        angular = (R @ spin[..., None])[..., 0] + np.cross(center, momentum)
+        return np.hstack((body.mass / self._total * center, momentum, angular)).ravel()
+
+    def sums(self, here: Array, ny: int, kinds: dict[str, list[int]], reference: Array) -> Array:
+        """Return the matrix (ny, ..) that sums the contributions of the bodies.
+
+        `here` are the outputs (ny,) and the contributions at the operating point. The matrix maps
+        the derivatives of both to the derivatives of the outputs.
+        """
+        total = np.eye(ny, len(here))
+        if not self._summed:
+            return total
+        center, momentum, _ = here[ny:].reshape(-1, 3, 3).sum(axis=0)
+        count = len(self._body.mass)
+        unit, none = np.eye(3), np.zeros((3, 3))
+
+        def write(rows: list[int], *factors: Array) -> None:
+            total[rows] = 0.0
+            total[rows, ny:] = reference.T @ np.tile(np.hstack(factors), count)
+
+        if "com" in kinds:
+            write(kinds["com"], unit, none, none)
+        if "momentum" in kinds:
+            # The angular momentum about the centre of mass c is h - c x p.
+            write(kinds["momentum"][:3], skew(momentum), -skew(center), unit)
+            write(kinds["momentum"][3:], none, unit, none)
+        return total
+
+
+def _parts(state: StateMap) -> tuple[dict[str, list[int]], dict[int, Indices]]:
+    """Return the rows of y by the name of the output, and the rows of each of its vectors."""
+    kinds, vectors, at = dict[str, list[int]](), dict[int, Indices](), 0
+    for output in state.robot.outputs:
+        count = len(output.signals) or len(state_indices(state, output))
+        kinds.setdefault(output.WORD, []).extend(range(at, at + count))
+        size = 3 if output.VECTORS else 1
+        for k in range(at, at + count, size):
+            vectors[k] = np.arange(k, k + size)
+        at += count
+    return kinds, vectors
