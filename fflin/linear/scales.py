@@ -18,9 +18,9 @@ ROUTE_TOLERANCE, DIFFERENCE_TOLERANCE = 1e-9, 1e-8
 # first value is for accelerations, and the second one for kinematics, which are shorter sums.
 ULPS, FEW_ULPS = 64.0, 8.0
 
-# Largest expected ratio of a rounding error to the largest of a few sampled rounding errors. For
-# columns that are only rounding errors, the ratio is larger, because no entry is known to a digit.
-# In 2,000 random robots, the largest ratios were 5 and 25.
+# Largest expected ratio of a rounding error to the largest of a few sampled rounding errors. The
+# second value is for columns that are only rounding errors, in which no digit is correct. A
+# ratio of 25 was observed in such a column.
 _SAFETY, _SAFETY_OF_ZERO = 20.0, 200.0
 
 # {block: its rows or columns}
