@@ -253,9 +253,10 @@ class Pace:
 
     @property
     def fastest(self) -> Poles | None:
-        """The limit with the fastest pole, among the poles that are constant during the run."""
-        constant = [each for each in self.limits if isinstance(each, Poles) and each.state_names]
-        return max(constant, key=lambda each: each.fastest, default=None)
+        """The limit with the fastest pole of a closed loop that is constant during the run."""
+        poles = [each for each in self.limits if isinstance(each, Poles) and each.state_names]
+        loops = [each for each in poles if each.system != ROBOT]
+        return max(loops, key=lambda each: each.fastest, default=None)
 
     def remarks(self, h: float) -> Iterator[str]:
         """Yield remarks on a step of h [s] that is too long."""
