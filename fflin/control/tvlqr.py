@@ -417,10 +417,10 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest at knot `end`, in base axes. Only rotors keep their speeds."""
+    """Return the model at rest at knot `end`, in base axes. Only wheels keep their speeds."""
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
-    rotors = robot.free_rotors
-    spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
+    wheels = robot.wheels_at(traj.v[end])
+    spinning = [joint.idx_v for joint in robot.joints if joint.name in wheels]
     v[spinning] = traj.v[end, spinning]
     held = equilibrium(robot, q, v=v)
     return Linearizer(robot, moving=True)(held.q, v, held.u)

@@ -3,8 +3,9 @@
 A rotor is a joint whose position does not affect the dynamics, such as the joint of a balanced
 wheel. At rest, a rotor may also be the last joint of an arm, whose position must be held. The angle
 of a wheel, in contrast, grows without bound and is never held. Therefore a rotor is flown as a
-reaction wheel only if it spins at the operating point, or if the robot's field `wheel_joints` names
-it.
+reaction wheel only if it spins at the operating point while the other joints are at rest, or if the
+robot's field `wheel_joints` names it. If other joints move, the rotor may be the wrist of a moving
+arm.
 """
 
 from __future__ import annotations
@@ -54,8 +55,12 @@ class FlownWheels(NamedTuple):
     if_spinning: tuple[str, ...]
 
     def at(self, speeds: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the names of the wheels at {joint: speed [rad/s]}."""
-        spun = (x for x in self.if_spinning if abs(speeds.get(x, 0.0)) > SPINNING)
+        """Return the names of the wheels at {joint: speed [rad/s | m/s]} of all joints."""
+        moving = [name for name, speed in speeds.items() if abs(speed) > SPINNING]
+        rotors = {*self.always, *self.if_spinning}
+        if not rotors.issuperset(moving):
+            return self.always
+        spun = [name for name in self.if_spinning if name in moving]
         return tuple(dict.fromkeys((*self.always, *spun)))
 
     def __call__(self, point: OperatingPoint) -> tuple[str, ...]:

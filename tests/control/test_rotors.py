@@ -396,3 +396,14 @@ def test_a_wheel_without_a_motor_keeps_its_momentum():
     at = [lin.state_names.index(f"omega_b.{axis}") for axis in "xy"]
     gyro = lin.A[np.ix_(at, at)]
     assert gyro == pytest.approx(np.array([[0.0, -1.0 / 4.01], [1.0 / 5.01, 0.0]]), rel=1e-9)
+
+
+def test_the_wrist_of_a_moving_arm_is_no_wheel():
+    # The last link of ets_vii is symmetric about its joint, which has no limits.
+    robot = fflin.load("ets_vii")
+    wrist = robot.joint_names[-1]
+    assert wrist in robot.free_rotors
+    assert set(robot.wheels_at(fflin.velocity(robot, {wrist: 0.1}))) == {wrist}
+    assert not robot.wheels_at(fflin.velocity(robot, {"joint_*": 0.1}))
+    lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_2": 0.1, wrist: 0.1}))
+    assert lin.wheels == ()
