@@ -35,7 +35,7 @@ NOTE_AT_ONCE = (
 # Note of every result that depends on matrices frozen at one instant of a motion.
 NOTE = (
     "the operating point is not an equilibrium, so the matrices change along the motion, and their "
-    "rank at one point does not decide about the motion; analyse the motion with "
+    "rank at one point proves nothing about the motion; analyse the motion with "
     "fflin.linearize_trajectory, or a steady motion with moving=True"
 )
 

@@ -78,7 +78,7 @@ def saturation(
     at, time = list(thrusters), sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
     least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
-    most = high[at]
+    most = np.maximum(high[at], np.finfo(float).tiny)  # a limit of zero
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         why = (

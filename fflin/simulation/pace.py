@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import ChartError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
@@ -32,7 +33,8 @@ from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
 
-ROBOT = "robot"  # name of the robot with constant inputs, in messages
+# Names in messages: the robot with constant inputs, and a loop that is constant during the run.
+ROBOT, CLOSED_LOOP = "robot", "closed loop"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.6)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
@@ -45,12 +47,13 @@ _VANISHING = 0.1
 # displacements give the same derivatives up to the relative difference _SMOOTH, the policy is
 # differentiable.
 _DISPLACEMENTS, _SMOOTH = (1e-6, 1e-5), 0.05
+_STEEPEST = 1e100  # largest derivative of a policy [SI units] that counts as finite
 
 # A step resolves a function of time if a parabola through its values at the three stages of the
 # step is accurate to _PARABOLA times the largest value. This is compared at the fractions _BETWEEN
-# of the step, in _WINDOWS steps of the run. _HALVINGS is the largest number of times that the step
-# is halved for a function of time. A function that jumps between steps is never resolved.
-_PARABOLA, _BETWEEN, _WINDOWS, _HALVINGS = 0.02, (0.2, 0.35, 0.7, 0.85), 16, 7
+# of the step, in _WINDOWS steps of the run. _TRIALS is the largest number of steps that are tried.
+# A function that jumps within a step is never resolved; it may jump at multiples of the step.
+_PARABOLA, _BETWEEN, _WINDOWS, _TRIALS = 0.02, (0.2, 0.35, 0.7, 0.85), 16, 8
 
 
 class Demand(NamedTuple):
@@ -163,14 +166,21 @@ class SampledLoop:
     loop: Callable[[LinearModel], Array]
 
     def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
-        """Return the largest step error; see `Limit`. The amplitudes are compared per sample."""
+        """Return the largest step error; see `Limit`. The amplitudes are compared per sample.
+
+        Only steps of `CommutatorFree4` are compared. For other methods, only the poles of the robot
+        limit the step.
+        """
         dt = self.lin.dt
         if method is not CommutatorFree4:
             return Demand(0.0, str)
         steps = max(1, math.ceil(dt / h - 1e-9))
+        with np.errstate(over="ignore", invalid="ignore"):
+            integrated = self.loop(self._integrated(dt / steps, steps))
+        if not np.isfinite(integrated).all():
+            return Demand(math.inf, lambda: "the sampled loop")
         exact, simulated = _matched(
-            np.linalg.eigvals(self.loop(self.lin)),
-            np.linalg.eigvals(self.loop(self._integrated(dt / steps, steps))),
+            np.linalg.eigvals(self.loop(self.lin)), np.linalg.eigvals(integrated)
         )
         lasts = np.abs(exact) > _VANISHING
         if not lasts.any():
@@ -213,12 +223,12 @@ class Signal:
         cls, name: str, signal: Callable[[float], Array], dt: float | None, duration: float
     ) -> Signal:
         """Return the limit of a function of time, for a given step dt [s] or the default step."""
-        h = LONGEST_STEP if dt is None else dt
+        step = min(LONGEST_STEP if dt is None else dt, duration)
         if np.array_equal(signal(0.0), signal(0.0)):
-            for halving in range(_HALVINGS + 1):
-                step = h / 2.0**halving
+            for _ in range(_TRIALS):
                 if _is_resolved(signal, step, duration):
                     return cls(name, step)
+                step = shorter(step)
         return cls(name, 0.0)
 
     def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
@@ -253,10 +263,9 @@ class Pace:
 
     @property
     def fastest(self) -> Poles | None:
-        """The limit with the fastest pole of a closed loop that is constant during the run."""
-        poles = [each for each in self.limits if isinstance(each, Poles) and each.state_names]
-        loops = [each for each in poles if each.system != ROBOT]
-        return max(loops, key=lambda each: each.fastest, default=None)
+        """The poles of the closed loop if they are constant during the run, or None."""
+        poles = (each for each in self.limits if isinstance(each, Poles))
+        return next((each for each in poles if each.system == CLOSED_LOOP), None)
 
     def remarks(self, h: float) -> Iterator[str]:
         """Yield remarks on a step of h [s] that is too long."""
@@ -269,9 +278,12 @@ class Pace:
         demand = self.demand(h)
         if demand.error > 1.0 + 1e-9:
             accurate, _ = self.step(shorter(h))
+            advice = "no step is accurate"
+            if self.demand(accurate).error <= 1.0:
+                advice = f"dt={accurate:g} (--dt {accurate:g}) is accurate"
             yield (
                 f"the step of {h:.3g} s is too long for {demand.mode()}, so the motion is not "
-                f"accurate; dt={accurate:g} (--dt {accurate:g}) is accurate"
+                f"accurate; {advice}"
             )
 
 
@@ -300,8 +312,7 @@ def limits_of_step(
     """
     A, B, names = _plant_model(plant, q, v, u)
     limits: list[Limit] = [Poles.of(ROBOT, A, names)]
-    turning = plant.turning
-    if rate := float(np.abs(v[turning]).max(initial=0.0)):
+    if rate := _largest_rate(plant, v[None]):
         limits.append(rotation(rate))
     if commands is None:
         return limits
@@ -309,8 +320,7 @@ def limits_of_step(
     if tracking is not None:
         poles = np.zeros(0) if sample else poles_along(tracking.schedule)
         limits.append(Poles("loop along the trajectory", poles))
-        reference = tracking.trajectory.v[:, turning]
-        limits.append(rotation(float(np.abs(reference).max(initial=0.0))))
+        limits.append(rotation(_largest_rate(plant, tracking.trajectory.v)))
         return limits
     linear = closed_loop(policy)
     if sample:
@@ -318,15 +328,22 @@ def limits_of_step(
         return limits if loop is None else [*limits, loop]
     if linear is not None:
         loop_names = _loop_names(policy, len(linear[0]))
-        limits.append(Poles.of("closed loop", linear[0], loop_names))
+        limits.append(Poles.of(CLOSED_LOOP, linear[0], loop_names))
         return limits
-    if not hasattr(commands, "advance"):
-        unlimited = np.full(len(plant.actuation.names), np.inf)
-        law = Law(commands, plant.actuation.names, (-unlimited, unlimited), np.inf)
+    if not (hasattr(commands, "advance") or plant.robot.orbit):
+        # Infinite commands are accepted, because limits may clip them. NaN is refused.
+        zero = np.zeros(len(plant.actuation.names))
+        law = Law(commands, plant.actuation.names, (zero, zero), np.inf)
         K = _derivatives(plant, law, q, v)
         if K is not None:
             limits.append(Poles.of("closed loop at the start", A + B @ K, names))
     return limits
+
+
+def _largest_rate(plant: Plant, v: Array) -> float:
+    """Return the largest angular rate [rad/s] of the base or of a joint, for rows v (N, nv)."""
+    base = np.linalg.norm(v[:, 3:6], axis=1)
+    return float(max(base.max(), np.abs(v[:, plant.turning]).max()))
 
 
 def _plant_model(
@@ -334,12 +351,27 @@ def _plant_model(
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Return A, B and the state names of the robot, about its motion through q and v.
 
-    B is for inputs in base axes, except in orbit.
+    Without an orbit, the errors are about a moving reference (5.1), and B is for inputs in base
+    axes. In orbit, A is zero if the base is rotated by 180 deg from the reference.
     """
-    robot = plant.robot.replace(outputs=[FullState()])
-    frame = plant.state.frame if robot.orbit else "local"
-    model = Linearizer(robot, frame=frame, moving=robot.orbit is None)(q, v, u)
+    robot, state = plant.robot.replace(outputs=[FullState()]), plant.state
+    if not robot.orbit:
+        model = Linearizer(robot, frame="local", moving=True)(q, v, _in_base_axes(plant, q, u))
+        return model.A, model.B, model.state_names
+    try:
+        model = Linearizer(robot, frame=state.frame, reference=state.reference)(q, v, u)
+    except ChartError:
+        return np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u))), state.names
     return model.A, model.B, model.state_names
+
+
+def _in_base_axes(plant: Plant, q: Array, u: Array) -> Array:
+    """Return inputs (nu,) with the wrenches in reference axes rotated to base axes."""
+    u = u.copy()
+    R = plant.state.rotation(q)
+    for held in plant.actuation.held:
+        u[held] = u[held].dot(R)
+    return u
 
 
 def _loop_names(policy: object, count: int) -> tuple[str, ...]:
@@ -350,7 +382,7 @@ def _loop_names(policy: object, count: int) -> tuple[str, ...]:
 
 
 def _sampled_loop(policy: object, sample: float) -> SampledLoop | None:
-    """Return the sampled loop of a linear policy, or None if its plant is not known."""
+    """Return the sampled loop of a linear policy without delay, or None without a model."""
     lin, K = feedback_of(policy)
     if lin is None:
         return None
@@ -360,7 +392,7 @@ def _sampled_loop(policy: object, sample: float) -> SampledLoop | None:
         return None
     decides = decider(policy)
     if isinstance(decides, LinearController):
-        return SampledLoop(sampled, generator, decides.loop_around)
+        return SampledLoop(sampled, generator, decides.sampled(sample).loop_around)
     if K is None:
         return None
     return SampledLoop(sampled, generator, lambda model: model.A - model.B @ K)
@@ -370,7 +402,7 @@ def _derivatives(plant: Plant, law: Law, q: Array, v: Array) -> Array | None:
     """Return the derivatives (nu, nx) of a policy's command at t = 0, or None if it has none.
 
     The derivatives are with respect to the errors about a moving reference (5.1), and the command
-    is in base axes (in orbit, in the axes of the frame).
+    is in base axes.
     """
     state, model = plant.state, plant.robot.model
     nv = state.nx // 2
@@ -380,18 +412,18 @@ def _derivatives(plant: Plant, law: Law, q: Array, v: Array) -> Array | None:
         along[:3] *= 2.0  # q_b is half of a small rotation
         at = pin.integrate(model, q, state.spread(along))
         u = law(0.0, at, v + state.spread(displacement[nv:]))
-        if not plant.robot.orbit:
-            R = state.rotation(at)
-            for held in plant.actuation.held:
-                u[held] = u[held].dot(R)
-        return u
+        return _in_base_axes(plant, at, u)
 
     start = command(np.zeros(state.nx))
+    if not np.isfinite(start).all():
+        return None
     estimates = []
     for size in _DISPLACEMENTS:
         columns = [(command(unit) - start) / size for unit in size * np.eye(state.nx)]
         estimates.append(np.array(columns).T)
     one, other = estimates
+    if not np.isfinite(estimates).all() or np.abs(other).max() > _STEEPEST:
+        return None
     if not np.abs(one - other).max() <= _SMOOTH * np.abs(other).max():
         return None
     return other

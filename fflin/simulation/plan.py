@@ -133,11 +133,12 @@ class Plan:
             plant.field.require_near(self.q)
         commands = None if policy is None else bound(policy, robot)
         sample = sample_of(policy, options.sample)
+        dt = None if options.dt is None else _positive("the step dt", options.dt)
         u = _inputs_at_start(policy, plant)
         limits = limits_of_step(plant, policy, commands, self.q, self.v, u, sample or 0.0)
         if options.disturbance is not None:
             disturbance = partial(plant.disturbing, q=self.q, v=self.v)
-            limits.append(Signal.of("the disturbance", disturbance, options.dt, duration))
+            limits.append(Signal.of("the disturbance", disturbance, dt, duration))
         pace = Pace(limits, self.method, duration)
         self.times = times = times_of(options, duration, sample, pace)
         policy = followed(policy, robot, held=times.sample * times.dt)
@@ -358,7 +359,7 @@ def step_of(
     The text is empty if the step is given or not short. A given step is shortened such that the
     duration is a whole number of steps.
     """
-    dt, mode, delay = options.dt, "", options.delay
+    dt, mode, delay = options.dt, "", number("delay", options.delay)
     if dt is None:
         dt, mode = pace.step()
         if sample or delay:

@@ -82,7 +82,7 @@ class Plant(Aba):
         )
         self._faulty = faults is not None
         # Start and length [s] of the present step; written by the caller of `stage`.
-        self.step = (0.0, np.inf)
+        self.step = (0.0, 1.0)
         # Indices in v of the angular rates: the angular velocity of the base, and the rates of all
         # joints that are not prismatic. Rotors are excluded, because nothing depends on the angle
         # of a rotor.

@@ -105,7 +105,9 @@ def simulate(
     policy : callable, optional
         Function policy(t, q, v) -> u (nu,) that returns the inputs of the robot, such as
         ``StateFeedback(lin, gain.K)``. A `GainSchedule` is also accepted, and then tracks its
-        trajectory. By default all inputs are zero.
+        trajectory. By default all inputs are zero. Before the run, a continuous function is called
+        at displaced states with t = 0, to choose the time step. So a function with memory must be
+        sampled (`sample`).
     x0 : array_like (nx,), optional
         Initial state in the chart defined by `frame` and `reference`, which is by default the chart
         of the policy's model.
@@ -144,7 +146,8 @@ def simulate(
 
         On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
     disturbance : callable, optional
-        Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
+        Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order. Before the
+        run, it is called at times of the whole run with the initial q and v, to choose the step.
     events : sequence of callable
         Functions event(t, q, v) -> float. The run ends after the step in which the value of an
         event becomes zero or negative.
@@ -296,7 +299,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         notes=(
             *growing(plan.policy),
             *plan.times.notes,
-            *_gained(plan, run, energy, float(scale[0])),
+            *_energy_note(plan, run, energy, float(scale[0])),
             *getattr(bound, "notes", ()),
             *half_turn_notes(plan, beyond, predicted=foresees is not None),
         ),
@@ -305,7 +308,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     )
 
 
-def _gained(plan: Plan, run: Recording, energy: Array, scale: float) -> Iterator[str]:
+def _energy_note(plan: Plan, run: Recording, energy: Array, scale: float) -> Iterator[str]:
     """Yield a note if the energy of a free motion changes, which is an error of the integration.
 
     The projection conserves the momentum whatever the step is, so only the energy shows the error.
@@ -470,8 +473,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
 def _runge_kutta(rate: Callable[[Array], Array], e: Array, h: float) -> Array:
     """Return e after a step of h [s] of the classical Runge-Kutta method, for de/dt = rate(e)."""
     after: Array = e
-    slope: Array = np.zeros(len(e))
+    derivative: Array = np.zeros(len(e))
     for fraction, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-        slope = rate(e + fraction * h * slope)
-        after = after + weight * h / 6.0 * slope
+        derivative = rate(e + fraction * h * derivative)
+        after = after + weight * h / 6.0 * derivative
     return after

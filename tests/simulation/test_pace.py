@@ -289,3 +289,50 @@ def test_the_pace_of_a_rotation_is_that_of_an_undamped_mode():
     step, mode = pace.step()
     assert step == 0.005 and "rotation" in mode
     assert 60.0 * 8.0 * (60.0 * step) ** 5 / 144.0 < 0.011
+
+
+def test_a_sample_far_above_the_period_of_a_mode_needs_short_steps():
+    robot = hub_with_mode(300.0)
+    lin = fflin.linearize(robot).discretize(1.0)
+    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+    motion = fflin.simulate(robot, policy, duration=1.0)
+    assert motion.t[1] <= 2e-4 and "q_m.array_mode_1" in motion.notes[0]
+
+
+def test_a_continuous_controller_with_a_sample_time_is_judged_as_it_is_flown():
+    robot = free_body(HUB)
+    lin = fflin.linearize(robot)
+    K = fflin.lqr(lin).K
+    # First-order filters of the state feedback, whose poles at -5 1/s are continuous.
+    filters = (-5.0 * np.eye(12), 5.0 * np.eye(12), -K, np.zeros((6, 12)))
+    motion = fflin.simulate(robot, fflin.LinearController(filters, lin), duration=1.0, sample=0.1)
+    assert motion.step == 0.01 and not motion.notes
+
+
+def test_an_infinite_command_at_the_start_is_cut_at_its_limit():
+    robot = free_body(HUB)
+    command = np.r_[np.inf, np.zeros(5)]
+    motion = fflin.simulate(robot, lambda t, q, v: command, duration=0.1, limits=2.0)
+    assert (motion.u[:, 0] == 2.0).all()
+
+
+@pytest.mark.parametrize("dt", ["0.01", np.nan, 0.0, 1e-320, np.inf])
+@pytest.mark.parametrize("disturbance", [None, Push(lambda t: 1.0)])
+def test_an_impossible_step_is_refused_with_and_without_a_disturbance(dt, disturbance):
+    with pytest.raises(fflin.InputError, match="step dt"):
+        fflin.simulate(free_body(HUB), duration=0.1, dt=dt, disturbance=disturbance)
+
+
+def test_a_robot_in_orbit_may_start_half_a_turn_from_its_reference():
+    robot = fflin.load("cubesat", orbit=500e3)
+    q0 = fflin.configuration(robot)
+    q0[3:7] = (1.0, 0.0, 0.0, 0.0)
+    turned = fflin.simulate(robot, q0=q0, duration=0.1)
+    assert not turned.stopped and turned.step == 0.01
+
+
+def test_a_spin_about_an_oblique_axis_counts_by_its_norm():
+    robot = free_body((20.0, 20.0, 20.0))
+    v0 = np.r_[np.zeros(3), 30.0 * np.ones(3)]
+    motion = fflin.simulate(robot, v0=v0, duration=0.5, dt=0.015)
+    assert "52 rad/s" in motion.notes[0]
