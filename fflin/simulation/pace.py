@@ -33,8 +33,9 @@ from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
 
-# Names in messages: the robot with constant inputs, and a loop that is constant during the run.
-ROBOT, CLOSED_LOOP = "robot", "closed loop"
+# Names in messages: the robot with constant inputs, a loop that is constant during the run, and a
+# rotation, which acts like an undamped oscillation.
+ROBOT, CLOSED_LOOP, ROTATION = "robot", "closed loop", "rotation of the base or of a joint"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.6)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
@@ -125,6 +126,8 @@ class Poles:
         size = abs(pole)
         if not size:
             return f"the {self.system}"
+        if self.system == ROTATION:
+            return f"the {ROTATION} at {size:.3g} rad/s"
         state = self._main_state(pole)
         if group_of(state) in ("q_b", "r_b") and self.system == ROBOT:
             return f"the rotation of the base at {size:.3g} rad/s"
@@ -150,7 +153,7 @@ class Poles:
 
 def rotation(rate: float) -> Poles:
     """Return the pole of a rotation at `rate` [rad/s], which acts like an undamped oscillation."""
-    return Poles("rotation of the base or of a joint", np.array([1j * rate]))
+    return Poles(ROTATION, np.array([1j * rate]))
 
 
 @dataclass(frozen=True, eq=False)
