@@ -33,7 +33,9 @@ SETTLED, DIVERGED = 1e-3, 1e3
 # _CONSTANTS: duration of a run that is compared with the prediction, in time constants of the
 # slowest pole. PATIENCE: largest duration of a random run, in settling times of the slowest pole.
 _CONSTANTS, PATIENCE = 3.0, 3.0
-_STEP = 0.25  # time step times the fastest rate, which is `pace` [1/s] in `Loop.runs`
+# Time steps times the fastest rate, which is `pace` [1/s] in `Loop.runs`. Runs that are compared
+# with the prediction have shorter steps, so that their relative integration error is about 1e-8.
+_STEP, _STEP_PREDICTED = 0.25, 0.1
 _WIDEST = 10.0  # largest joint displacement [rad|m] to which the step is adapted
 # The steps of a diverging run are shortened by the factor _FINER, at most _FINEST times.
 _FINER, _FINEST = 8, 2
@@ -153,7 +155,8 @@ class Loop:
         # The step must also be short enough for the damping of all modes.
         matrices = [free.A] if lin.dt else [free.A, self.rate]
         poles = [Poles("robot and the loop", np.linalg.eigvals(each)) for each in matrices]
-        dt, _ = Pace(poles, CommutatorFree4, horizon).step(_STEP / pace)
+        step = _STEP_PREDICTED if predicts else _STEP
+        dt, _ = Pace(poles, CommutatorFree4, horizon).step(step / pace)
         every = 1
         if lin.dt:
             every = math.ceil(lin.dt / dt)

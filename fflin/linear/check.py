@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -278,10 +279,17 @@ class References:
         """
         route, g = self.route, self.route.state.groups
         nx, nu = route.state.nx, len(lin.u0)
-        # A unit of the amplitude of a mode moves its body by `scale` [rad or m].
-        bodies = route.state.robot.joints
+        # A unit of the amplitude of a mode moves its body by `scale` [rad or m]. A body that hardly
+        # rotates also translates. Because the modal mass is 1, it translates by at least 1 /
+        # sqrt(mass) [m] per unit of the amplitude.
+        robot = route.state.robot
+        bodies = robot.joints
+        widest = math.sqrt(robot.mass)
+        per_unit = np.array([1.0 / body.scale for body in bodies])
+        is_mode = np.array([body.mode for body in bodies], dtype=bool)
+        per_unit[is_mode] = np.minimum(per_unit[is_mode], widest)
         steps = np.zeros(nx + nu)
-        steps[g.q_m] = [(modes if body.mode else joints) / body.scale for body in bodies]
+        steps[g.q_m] = np.where(is_mode, modes, joints) * per_unit
         # Keep the points of the differences well inside the chart, because f is steep near the
         # limit |q_b| = 1 of the chart.
         steps[g.q_b] = 5e-3 * (1.0 - np.linalg.norm(lin.x0[g.q_b]))
@@ -289,7 +297,6 @@ class References:
         # and linear in the inputs. So central differences have no truncation error, even with large
         # steps.
         steps[g.r_b] = 0.1
-        per_unit = np.array([1.0 / body.scale for body in bodies])
         speed = np.abs(route.nu)
         fastest = max(1.0, _largest(speed[ANGULAR]), _largest(speed[6:] / per_unit))
         steps[g.omega_b] = 0.1 * fastest
@@ -320,6 +327,8 @@ class References:
         size = size / steps + np.hstack((route.sums_A, route.sums_B))
         rounding = ULPS * EPS * size
         rounding += sampled(g._asdict(), slopes, [again], route.units)
+        # Differences may be exactly zero where M^-1, and so the model, has rounding errors.
+        rounding = np.maximum(rounding, np.hstack((route.A.rounding, route.B.rounding)))
         return (
             Reference(slopes[:, :nx], route.A.scale, rounding[:, :nx]),
             Reference(slopes[:, nx:], route.B.scale, rounding[:, nx:]),

@@ -178,13 +178,14 @@ class SampledLoop:
         if method is not CommutatorFree4:
             return Demand(0.0, str)
         steps = max(1, math.ceil(dt / h - 1e-9))
+        exact_loop = self.loop(self.lin)
+        if not np.abs(exact_loop).max(initial=0.0) < _STEEPEST:  # the run stops at once
+            return Demand(0.0, str)
         with np.errstate(over="ignore", invalid="ignore"):
             integrated = self.loop(self._integrated(dt / steps, steps))
         if not np.isfinite(integrated).all():
             return Demand(math.inf, lambda: "the sampled loop")
-        exact, simulated = _matched(
-            np.linalg.eigvals(self.loop(self.lin)), np.linalg.eigvals(integrated)
-        )
+        exact, simulated = _matched(np.linalg.eigvals(exact_loop), np.linalg.eigvals(integrated))
         lasts = np.abs(exact) > _VANISHING
         if not lasts.any():
             return Demand(0.0, str)
