@@ -50,7 +50,9 @@ def transition_matrices(traj: LinearTrajectory) -> Array:
 
 
 def reachable(traj: LinearTrajectory, known: Array) -> Split:
-    r"""Return the errors at the end that the inputs can set from zero; `known` (k, nx) cannot.
+    r"""Return the errors at the end that the inputs can set from zero.
+
+    The inputs cannot set the errors `known` (k, nx).
 
     The factor of the controllability Gramian obeys
     :math:`F_{i+1} = [\Phi_i F_i, \Gamma_i]`, with the transition matrix :math:`\Phi_i` and the
@@ -69,7 +71,9 @@ def reachable(traj: LinearTrajectory, known: Array) -> Split:
 
 
 def seen(traj: LinearTrajectory, known: Array) -> Split:
-    r"""Return the errors at the start that the outputs determine; the motions `known` do not.
+    r"""Return the errors at the start that the outputs determine.
+
+    The outputs do not determine the motions `known`.
 
     `known` has the shape (nx, k). The factor of the observability Gramian obeys
     :math:`O_i = [C_i; O_{i+1} \Phi_i]`, with the outputs at the knots.

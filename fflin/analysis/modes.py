@@ -26,8 +26,8 @@ from fflin.robot.robot import Robot
 # frequency therefore count as rigid-body modes.
 _NO_STIFFNESS = 1e-13
 
-# The energy of a body is a sum, in which large terms of balls and of their link may cancel. The
-# energy counts as zero up to this fraction of the terms.
+# The energy of a body is a sum in which large terms of balls and of their link may cancel. The
+# energy counts as zero below this fraction of the terms.
 _ROUNDING = 1e-13
 
 

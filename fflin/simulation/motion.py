@@ -69,7 +69,7 @@ class Motion(StatesAndInputs, Design):
     momentum_drift : ndarray (N,)
         Relative error of the simulated momentum. The expected momentum is the initial momentum
         plus the impulse of external forces. The difference from the expected momentum is divided
-        by the largest momentum that the kinetic energy permits, see (11.5) of docs/derivation.md:
+        by the largest momentum that the kinetic energy permits, see (11.6) of docs/derivation.md:
 
         - Linear momentum is divided by the mass times the root-mean-square speed of the mass
           elements in the row with the fastest motion.

@@ -4,7 +4,7 @@ In a step of h [s], an integrator multiplies the amplitude of a mode with the po
 with R = R(lambda h). The exact factor is exp(Re lambda h). A step is short enough for a mode if it
 changes the damping of the mode by at most 5 %, or the amplitude over the run by at most 1 %:
 
-    |ln|R| - Re(lambda) h| <= max(0.05 |Re(lambda)| h, 0.01 h / T)                          (11.6)
+    |ln|R| - Re(lambda) h| <= max(0.05 |Re(lambda)| h, 0.01 h / T)                          (11.4)
 
 T is the duration of the run. The step must be short enough for all modes of the robot with constant
 inputs, and for all modes of the closed loop.
@@ -37,7 +37,7 @@ from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
 # rotation, which acts like an undamped oscillation.
 ROBOT, CLOSED_LOOP, ROTATION = "robot", "closed loop", "rotation of the base or of a joint"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
-_DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.6)
+_DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
 
 # A pole of a sampled loop below this magnitude decays within two samples. The step hardly matters
@@ -58,7 +58,7 @@ _PARABOLA, _BETWEEN, _WINDOWS, _TRIALS = 0.02, (0.2, 0.35, 0.7, 0.85), 16, 8
 
 
 class Demand(NamedTuple):
-    """Step error of one mode: the ratio of the left to the right side of (11.6), and the mode."""
+    """Step error of one mode: the ratio of the left to the right side of (11.4), and the mode."""
 
     error: float
     mode: Callable[[], str]
@@ -68,12 +68,12 @@ class Limit(Protocol):
     """Something that limits the step, such as the poles of the robot."""
 
     def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
-        """Return the largest step error (11.6) of a step of h [s]."""
+        """Return the largest step error (11.4) of a step of h [s]."""
         ...
 
 
 def step_error(exact: Array, simulated: Array, h: float, duration: float) -> Array:
-    """Return the ratio of the left to the right side of (11.6), for each mode.
+    """Return the ratio of the left to the right side of (11.4), for each mode.
 
     `exact` and `simulated` are the logarithms of the exact and of the simulated factor by which the
     amplitude changes in h [s].
@@ -249,7 +249,7 @@ class Pace:
         self._duration = duration
 
     def demand(self, h: float) -> Demand:
-        """Return the largest step error (11.6) of a step of h [s]; it should be at most 1."""
+        """Return the largest step error (11.4) of a step of h [s]; it should be at most 1."""
         demands = [each.demand(self._method, h, self._duration) for each in self.limits]
         return max(demands, key=lambda each: each.error, default=Demand(0.0, str))
 

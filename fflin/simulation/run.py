@@ -263,7 +263,7 @@ class Conserved:
         - the momentum about the centre of mass (N, 6);
         - the centre of mass (N, 3) relative to the fixed point;
         - the momentum about the fixed point (N, 6);
-        - the upper bounds (2,) of linear and angular momentum (11.5).
+        - the upper bounds (2,) of linear and angular momentum (11.6).
 
         A momentum (6,) consists of linear and angular momentum, in world axes. In orbit, the energy
         is the Jacobi integral. The momentum about the fixed point is replaced by the Jacobi

@@ -312,7 +312,7 @@ def _energy_note(plan: Plan, run: Recording, energy: Array, scale: float) -> Ite
     """Yield a note if the energy of a free motion changes, which is an error of the integration.
 
     The projection conserves the momentum whatever the step is, so only the energy shows the error.
-    `scale` is the largest linear momentum that the kinetic energy permits (11.5).
+    `scale` is the largest linear momentum that the kinetic energy permits (11.6).
     """
     robot = plan.plant.robot
     driven = run.u.any() or plan.options.disturbance is not None or robot.springs.damping.any()

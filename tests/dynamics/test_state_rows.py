@@ -113,9 +113,17 @@ def test_a_policy_may_keep_what_it_is_given():
     def push(t, q, v):
         return policy(t, q, v)[: robot.nv]
 
-    fflin.simulate(robot, policy, v0=0.1 * v0, duration=0.05, dt=0.01, disturbance=push)
-    # The step is chosen by displacements of the start, and by the disturbance over time.
-    assert len(kept) >= 40
+    calls = []
+
+    def count(t, q, v, u):
+        calls.append(len(kept))
+
+    fflin.simulate(
+        robot, policy, v0=0.1 * v0, duration=0.05, dt=0.01, disturbance=push, callback=count
+    )
+    # Before the run, the functions are called to choose the step. In each step they are called at
+    # four stages.
+    assert np.diff(calls)[:-1].tolist() == [8] * 4
     assert all((q == q_then).all() and (v == v_then).all() for q, v, q_then, v_then in kept)
 
 
