@@ -243,9 +243,13 @@ class Modes:
             if robot.stiffness.get(joint.name)
         }
         rows = [["rad/s", "clamped", "mode", "elastic energy"]]
+        # Freeing the link raises the frequencies. A motion far below all clamped frequencies, such
+        # as an oscillation in orbit, is no mode of an appendage, although it strains the appendages
+        # a little.
+        least = 0.5 * min(clamped.values(), default=0.0)
         for mode in self.vibrations:
             name = next(iter(mode.strain), "")
-            if name in clamped:
+            if name in clamped and mode.frequency > least:
                 percents = _percents(mode.strain, 60)
                 rows.append([f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, percents])
         of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]

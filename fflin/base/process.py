@@ -16,12 +16,16 @@ _INTERVAL = 0.1
 LONG_RUN = 20.0  # duration of a run [s] after which a faster engine is recommended
 
 
+def on_terminal() -> bool:
+    """Return whether stderr is a terminal."""
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
 class Progress:
     """Progress bar; by default, it appears only on a terminal, and only after one second."""
 
     def __init__(self, shown: bool | None = None) -> None:
-        terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._shown = terminal if shown is None else shown
+        self._shown = on_terminal() if shown is None else shown
         self._start = time.monotonic()
         self._next = self._start + (_PATIENCE if shown is None else 0.0)
         self._drawn = False

@@ -23,6 +23,9 @@ from typing import ParamSpec, Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
+from fflin.base.process import Progress as ProgressBar
+from fflin.base.process import on_terminal
+from fflin.base.tables import counted
 from fflin.base.validation import Array, whole
 from fflin.batch.files import FileStore, MemoryStore
 from fflin.kernel.compiled import available_cores
@@ -86,6 +89,11 @@ class Execution(ExitStack):
         if progress is not None and not callable(progress):
             raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
         super().__init__()
+        self.progress = progress
+        if progress is None and on_terminal():
+            bar = ProgressBar()
+            self.progress = bar
+            self.callback(bar.close)
         self.executor, self._threads = executor, threads or available_cores()
         if workers is not None:
             self.executor = self.enter_context(OwnWorkers(workers))
@@ -98,11 +106,26 @@ class Execution(ExitStack):
             count = getattr(self.executor, name, None)
             if isinstance(count, int) and count > 0:
                 return count
-        client = getattr(self.executor, "_client", None)
-        if client is not None and hasattr(client, "nthreads"):
-            threads: int = sum(client.nthreads().values())
-            return max(1, threads)
+        threads = self._dask_threads()
+        if threads is not None:
+            return max(1, sum(threads.values()))
         return _UNKNOWN_WORKERS
+
+    def workers(self) -> set[str]:
+        """Return the addresses of the workers, if the executor is a Dask client's.
+
+        Dask replaces lost workers and computes their chunks again without a message. Other
+        executors raise an error.
+        """
+        return set(self._dask_threads() or {})
+
+    def _dask_threads(self) -> dict[str, int] | None:
+        """Return {address of a worker: number of threads}, or None if there is no Dask client."""
+        client = getattr(self.executor, "_client", None)
+        if client is None or not hasattr(client, "nthreads"):
+            return None
+        threads: dict[str, int] = client.nthreads()
+        return threads
 
 
 def run_chunks(
@@ -115,8 +138,10 @@ def run_chunks(
     of_what: str = "rows",
     made: Callable[[dict[str, Array]], object] | None = None,
     upto: int | None = None,
-) -> None:
-    """Compute the missing chunks of a store, and save the results.
+) -> int:
+    """Compute the missing chunks of a store, save the results, and return the number of kept rows.
+
+    Kept rows are those that the store contains from before this call.
 
     The store saves the rows and results for which it has arrays. If `upto` is given, only chunks
     that begin before row `upto` are computed.
@@ -133,8 +158,10 @@ def run_chunks(
             done += stop - start
         elif upto is None or start < upto:
             left.append((start, stop))
+    kept = done
     if progress and done:
         progress(done, store.count)
+    workers = how.workers()
     failed, notes = list[tuple[int, int, str]](), list[str]()
     for (start, stop), result in _results(job, rows, store, left, how):
         if isinstance(result, str):
@@ -150,8 +177,17 @@ def run_chunks(
     if notes:
         more = f" (and {len(notes) - 1} more such warnings)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
+    lost = workers - how.workers()
+    if lost:
+        warnings.warn(
+            f"{counted(len(lost), 'worker')} of the executor ended during the call: "
+            f"{listed(sorted(lost))}; other workers computed the chunks again",
+            FflinWarning,
+            stacklevel=3,
+        )
     if failed and made:
         raise _failure(sorted(failed), store, of_what, made)
+    return kept
 
 
 def _results(

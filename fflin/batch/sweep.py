@@ -105,7 +105,7 @@ def sweep(
         chunk takes about 4 MB. A resumed sweep uses the chunk size of its unfinished file.
     progress : callable, optional
         Function ``progress(done, total)``, called after every chunk with the numbers of finished
-        points and of all points.
+        points and of all points. By default, a long call shows a bar if stderr is a terminal.
     out : str or Path, optional
         File to write, .h5 or .npz. For .h5, chunks are first written to NAME.part. After a crash,
         the same call resumes with the intact chunks in NAME.part.
@@ -167,7 +167,7 @@ def sweep(
         )
     with closing(store), how:
         of_what = "configurations"
-        run_chunks(job, task.rows, store, how, progress, of_what=of_what, made=task.batch)
+        run_chunks(job, task.rows, store, how, how.progress, of_what=of_what, made=task.batch)
         batch = task.batch(store.complete())
     if path is not None and path.suffix == ".npz":
         batch.save(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -13,19 +14,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fflin.base import intervals
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import CODECS, reading
 from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
-from fflin.campaign.runs import KINDS, kind_named
+from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS, kind_named
 from fflin.campaign.spreads import SEED
 from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:
     from fflin.campaign.runs import CampaignJob
+    from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
 NOT_RUN = -1.0  # value of `stop` in the rows of a file that contain no run
@@ -86,9 +88,11 @@ class Campaign(FrozenArrays):
     - ``attitude`` [deg], ``position`` [m], ``joints``, ``omega_b``, ``v_b`` and ``joint rates``:
       final error in the states of this kind. These six names are the kinds of error, each called
       KIND below.
+    - ``wheel speeds`` [rad/s] and ``modes`` [sqrt(kg) m]: largest final error of the speeds of
+      wheels, and of the coordinates of flexible appendages and slosh.
     - The name of a state or input: final value of this signal, including its sign.
-    - ``worst NAME``: largest magnitude during the run: of the error if NAME is a kind or a state,
-      of the command if NAME is an input.
+    - ``worst NAME``: largest magnitude during the run: of the error if NAME is a kind, a state,
+      ``wheel speeds`` or ``modes``; of the command if NAME is an input.
     - ``settle KIND`` [s]: settling time, after which the error of this kind stays within 2 % of its
       largest value. ``settle`` [s]: the longest settling time of attitude, position and joints, as
       far as the policy controls them.
@@ -127,7 +131,15 @@ class Campaign(FrozenArrays):
     goals : tuple of str
         Conditions whose success rates appear in the printed report and in `plot_campaign`.
     notes : tuple of str
-        Remarks on the time step of the runs; see `Motion.notes`.
+        Remarks on the time step of the runs, see `Motion.notes`, and on runs that were read from a
+        file.
+    wheels, modes : tuple of str
+        Joints that were simulated as wheels, and modes of flexible appendages and slosh.
+    x_end : tuple of float
+        Target state (nx,) at the end of a run, or the initial state if there is no target.
+    replay_settings : mapping
+        Names of the dispersions and options of the call, with which `replay` repeats a run of a
+        campaign that was loaded from a file.
 
     Examples
     --------
@@ -173,6 +185,10 @@ class Campaign(FrozenArrays):
     goals: tuple[str, ...]
     confidence: float
     notes: tuple[str, ...] = ()
+    wheels: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
+    x_end: tuple[float, ...] = ()
+    replay_settings: Mapping[str, object] = field(default_factory=dict)
     _job: CampaignJob | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
@@ -220,7 +236,16 @@ class Campaign(FrozenArrays):
             at = [list(KINDS).index(kind) for kind in self.judged]
             return self.settle[:, at].max(axis=1, initial=0.0), "s"
         of, _, rest = name.partition(" ")
-        of, rest = (of, rest) if of in ("worst", "settle", "drawn") else ("final", name)
+        if of not in ("worst", "settle", "drawn"):
+            of, rest = "final", name
+        indices = {WHEEL_SPEEDS: self._indices("qdot_m", self.wheels)}
+        indices[MODES] = self._indices("q_m", self.modes)
+        if indices.get(rest) and of in ("final", "worst"):
+            at = indices[rest]
+            errors = self.largest_x[:, at]
+            if of == "final":
+                errors = np.abs(self.x[:, at] - np.array(self.x_end)[at])
+            return np.where(self.stopped, np.inf, errors.max(axis=1)), self.state_units[at[0]]
         states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
@@ -234,7 +259,12 @@ class Campaign(FrozenArrays):
                 values, unit = arrays[:, names.index(rest)], units[names.index(rest)]
                 bounded = of == "worst" or arrays is self.errors
                 return (np.where(self.stopped, np.inf, values) if bounded else values), unit
-        raise unknown("figure", rest, [each for names, *_ in groups for each in names])
+        known = [each for names, *_ in groups for each in names]
+        raise unknown("figure", rest, [*known, *(name for name, at in indices.items() if at)])
+
+    def _indices(self, group: str, joints: tuple[str, ...]) -> list[int]:
+        """Return the indices of the states of some joints, for "q_m" or "qdot_m"."""
+        return [self.state_names.index(f"{group}.{name}") for name in joints]
 
     def met(self, condition: object) -> Mask:
         """Return a mask (N,) of the runs that meet a condition.
@@ -322,25 +352,62 @@ class Campaign(FrozenArrays):
         }
         return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
-    def replay(self, run: int) -> Motion:
+    def replay(
+        self, run: int, *, robot: Robot | None = None, policy: object = None, **options: object
+    ) -> Motion:
         """Simulate a run of the campaign again, and return its motion.
 
         In the returned motion, q, v and u equal the original run bit for bit. The state x is
         computed from q and v by different code. It therefore agrees only to machine precision, and
         the angles of continuous joints may differ by full turns.
 
+        Parameters
+        ----------
+        run : int
+            Index of the run.
+        robot, policy : optional
+            Robot and policy of the campaign. They are needed for a campaign that was loaded from a
+            file.
+        **options
+            Options of `monte_carlo` that a file cannot contain: functions such as `disturbance`,
+            and a linear model as `target`.
+
         Raises
         ------
         InputError
-            If the run does not exist, or the campaign was loaded from a file.
+            If the run does not exist, or the campaign was loaded from a file and the robot or an
+            option is missing or is not that of the campaign.
+
+        Warns
+        -----
+        FflinWarning
+            If the motion does not end at the recorded q and v, because the policy or an option
+            differs.
         """
         at = whole("run", run, 0, len(self) - 1)
-        if self._job is None:
+        job = self._job
+        if job is None and robot is None:
             raise InputError(
                 "the campaign was loaded from a file, which does not contain its robot and policy; "
-                "call monte_carlo again with the same seed, and replay a run of the new campaign"
+                "give them, as in replay(0, robot=robot, policy=policy)"
             )
-        return self._job.replay(np.array(self.drawn[at]))
+        if job is None or robot is not None:
+            from fflin.campaign.replay import job_of
+
+            job = job_of(self, robot, policy, options)
+        motion = job.replay(np.array(self.drawn[at]))
+        missed = max(
+            float(np.abs(motion.q[-1] - self.q[at]).max()),
+            float(np.abs(motion.v[-1] - self.v[at]).max()),
+        )
+        if missed > 0.0:
+            warnings.warn(
+                f"the motion ends {missed:.2g} (largest difference of q and v) from the recorded "
+                "end of the run; the policy, an option, the version or the processor differs",
+                FflinWarning,
+                stacklevel=2,
+            )
+        return motion
 
     def save(self, path: str | Path) -> None:
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.
@@ -402,8 +469,15 @@ class Campaign(FrozenArrays):
         values = dict[str, Any]()
         for key in ARRAYS:
             values[key] = arrays[key] if run.all() else arrays[key][run]
-        # Files of earlier versions have no notes.
-        header = {"notes": [], **header}
+        # Files of earlier versions do not contain these fields.
+        header = {
+            "notes": [],
+            "wheels": [],
+            "modes": [],
+            "x_end": [],
+            "replay_settings": {},
+            **header,
+        }
         for key in _HEADER:
             value = header[key]
             values[key] = tuple(value) if isinstance(value, list) else value

@@ -368,8 +368,8 @@ def funnel(
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
             tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
-            if progress:
-                progress(knot + 1, len(jobs))
+            if how.progress:
+                how.progress(knot + 1, len(jobs))
     return Funnel._of(
         motion,
         robot=robot,

@@ -20,6 +20,7 @@ from fflin.base.validation import instance, share, truth, whole
 from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
+from fflin.campaign.replay import replay_settings
 from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
 from fflin.kernel.tree import LANES
@@ -219,17 +220,31 @@ def monte_carlo(
         request = _request(job, runs, header)
         earlier = None if truth("overwrite", overwrite) else _earlier(path, request)
         if earlier and until is None and len(earlier) == runs:
-            return replace(earlier, goals=wanted, confidence=confidence, _job=job)
+            note = (
+                f"all runs are from {path}, which an earlier call wrote; none was simulated again"
+            )
+            return replace(
+                earlier,
+                goals=wanted,
+                confidence=confidence,
+                notes=(*earlier.notes, note),
+                _job=job,
+            )
         if store is None:
             texts = {"header": json.dumps(header)}
             store = files.FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
     made = partial(Campaign.of, header=header, job=job)
     with closing(store), how:
-        expect(progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
+        expect(how.progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
         done = runs if until is None else min(_STAGE, runs)
+        resumed: int | None = None  # number of runs that an interrupted call has left in the file
         while True:
-            run_chunks(job, job.rows, store, how, progress, of_what="runs", made=made, upto=done)
+            kept = run_chunks(
+                job, job.rows, store, how, how.progress, of_what="runs", made=made, upto=done
+            )
+            if resumed is None:
+                resumed = kept
             if done == runs:
                 break
             found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
@@ -241,6 +256,9 @@ def monte_carlo(
             unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
             store.write(start, stop, unused)
         campaign = Campaign.of(store.complete(), header, job)
+        if resumed:
+            note = f"{resumed:,} of {runs:,} runs are from the unfinished file of an earlier call"
+            campaign = replace(campaign, notes=(*campaign.notes, note))
     if path and path.suffix == ".npz":
         campaign._save(path, request=request)
     return campaign
@@ -324,6 +342,10 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "engine": job.engine,
         "times": (job.steps * plan.times.dt).tolist(),
         "input_limits": np.fmax(-plan.limits.low, plan.limits.high).tolist(),
+        "wheels": [name for name in robot.joint_names if name in plan.flown],
+        "modes": [joint.name for joint in robot.modes],
+        "x_end": (job.target if job.target.ndim == 1 else job.target[-1]).tolist(),
+        "replay_settings": replay_settings(job.given, job.options),
     }
 
 

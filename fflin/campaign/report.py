@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from fflin.base.tables import folded, grid
-from fflin.campaign.runs import KINDS
+from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS
 from fflin.simulation.run import STOPS
 
 if TYPE_CHECKING:
@@ -24,10 +24,12 @@ def campaign_report(campaign: Campaign) -> str:
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
     title += f" in steps of {campaign.dt:.3g} s"
     rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
-    for name, unit in KINDS.items():
+    for name, unit in _errors(campaign).items():
         figures = [quantile(name, p).value for p in _SHARES]
         figures.append(quantile(f"worst {name}", 0.95).value)
-        when = _when(quantile(f"settle {name}", 0.95).value, " s")
+        when = "."
+        if name in KINDS:
+            when = _when(quantile(f"settle {name}", 0.95).value, " s")
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
     causes: dict[str, list[str]] = {}
     for name, found in influences(campaign).items():
@@ -40,6 +42,20 @@ def campaign_report(campaign: Campaign) -> str:
     ended = ended_of(campaign)
     head = folded([*goals, ended, f"{title}, seed {campaign.seed}{by}", *campaign.notes])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
+
+
+def _errors(campaign: Campaign) -> dict[str, str]:
+    """Return {name of an error: unit} for the rows of the table.
+
+    Errors that are zero in all runs, for example of joints that a robot does not have, are left
+    out.
+    """
+    names = dict(KINDS)
+    if campaign.wheels:
+        names[WHEEL_SPEEDS] = campaign.figure(WHEEL_SPEEDS)[1]
+    if campaign.modes:
+        names[MODES] = campaign.figure(MODES)[1]
+    return {name: unit for name, unit in names.items() if campaign.values(f"worst {name}").any()}
 
 
 def ended_of(campaign: Campaign) -> str:

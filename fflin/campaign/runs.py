@@ -48,6 +48,8 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
+# Errors that only some robots have. They have no settling time.
+WHEEL_SPEEDS, MODES = "wheel speeds", "modes"
 # Attitude error [deg] above which a run of `validity` or `funnel` counts as having left the chart.
 # The chart ends at 180 deg.
 EDGE = 176.0
@@ -127,6 +129,7 @@ class CampaignJob:
     ) -> None:
         again = partial(CampaignJob, robot, policy, given, seed, options=options)
         self._again = partial(again, judge=judge, over=over)
+        self.options = options
         settings: dict[str, Any] = dict(options)
         histories = settings.pop("histories", 0)
         unlimited = settings.pop("unlimited", False)
@@ -153,6 +156,7 @@ class CampaignJob:
             nu = state.velocities(v)
             self.target, self.path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
         given = dict.fromkeys(state.names, 0.0) if given is None else given
+        self.given = given
         with placed(given):
             self.dispersions = Dispersions(
                 given, self.plant, self.plan.policy, self.x0, seed, times
@@ -422,8 +426,8 @@ def expect(
 ) -> None:
     """Report the estimated time of jobs to a progress bar.
 
-    Each entry of `work` is (job, drawn values of its first runs, number of runs). Only the
-    progress bar of the command line has the method `expect`; other progress functions do not
+    Each entry of `work` is (job, drawn values of its first runs, number of runs). Only
+    fflin's progress bar has the method `expect`; other progress functions do not
     receive the estimate.
     """
     tell = getattr(progress, "expect", None)

@@ -255,10 +255,10 @@ def validity(
         # A random run usually settles, and ends, after about 1 / PATIENCE of its largest duration.
         # So all random runs take about as long as `few` runs of the largest duration.
         few = math.ceil(samples / PATIENCE)
-        expect(progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
-        told = progress and partial(_report, progress, 0, total)
+        expect(how.progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
+        told = how.progress and partial(_report, how.progress, 0, total)
         predicted = settle(predicting, first, how, told)
-        told = progress and partial(_report, progress, len(first), total)
+        told = how.progress and partial(_report, how.progress, len(first), total)
         random = settle(settling, second, how, told)
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])

@@ -2,6 +2,9 @@
 
 from itertools import product
 
+import os
+import signal
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -258,3 +261,29 @@ def test_dask_flies_the_same(robots):
         )
     assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
     assert np.array_equal(there.replay(19).q[-1], here.q[19])
+
+
+@pytest.mark.process
+def test_a_lost_worker_of_dask_is_told(robots):
+    distributed = pytest.importorskip("distributed")
+    robot = robots["planar_detumble"]
+    case = {"runs": 64, "duration": 0.2, "dt": 0.02, "engine": "python", "chunk": 8}
+    here = fflin.monte_carlo(robot, None, {"q_b": 0.05}, **case)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        processes = list(client.run(os.getpid).values())
+
+        def kill(done, total):
+            if processes:
+                os.kill(processes.pop(), signal.SIGKILL)
+                processes.clear()
+
+        with pytest.warns(fflin.FflinWarning, match="1 worker of the executor ended"):
+            there = fflin.monte_carlo(
+                robot, None, {"q_b": 0.05}, executor=client.get_executor(), progress=kill, **case
+            )
+    assert np.array_equal(here.q, there.q)

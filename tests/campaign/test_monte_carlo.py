@@ -1,6 +1,7 @@
 """Campaigns: the runs are those of `simulate`, equal for any workers, and statistics that hold."""
 
 import csv
+import io
 import itertools
 import os
 import sys
@@ -17,6 +18,7 @@ from scipy import stats
 from scipy.linalg import expm
 
 import fflin
+from fflin.base import process
 from fflin.campaign.campaign import ARRAYS
 from fflin.campaign.report import influences, worst_runs
 from fflin.campaign.runs import KINDS, CampaignJob
@@ -417,7 +419,7 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
     for name in ARRAYS:
         assert np.array_equal(getattr(again, name), getattr(campaign, name))
     assert str(again) == str(campaign)
-    with pytest.raises(fflin.InputError, match="file"):
+    with pytest.raises(fflin.InputError, match="loaded from a file"):
         again.replay(0)
     content = bytearray((tmp_path / f"runs{ending}").read_bytes())
     content[len(content) // 2] ^= 1
@@ -779,3 +781,70 @@ def test_what_no_input_pushes_is_judged_in_no_campaign_either():
         "inf" in line.split() for line in [*str(late).splitlines(), *worst_runs(late, 2)]
     )
     assert " not yet " in worst_runs(late, 1)[1]
+
+
+def wheels_of(robot):
+    """The robot with a wheel on each axis and no other inputs."""
+    return robot.replace(
+        inputs=[
+            fflin.ReactionWheel(name=name, axis=axis, inertia=2e-4)
+            for name, axis in zip("xyz", np.eye(3).tolist(), strict=True)
+        ]
+    )
+
+
+def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
+    robot = wheels_of(fflin.load("cubesat"))
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    options = {"runs": 4, "duration": 1.0, "dt": 0.05, "engine": "python"}
+    campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, **options)
+    rates = [campaign.state_names.index(f"qdot_m.{name}") for name in "xyz"]
+    largest = np.abs(campaign.x[:, rates]).max(axis=1)
+    assert np.array_equal(campaign.values("wheel speeds"), largest)
+    worst = campaign.largest_x[:, rates].max(axis=1)
+    assert np.array_equal(campaign.values("worst wheel speeds"), worst)
+    rows = [row.split("  ")[0] for row in str(campaign).splitlines()]
+    assert "wheel speeds" in rows
+    assert "joints" not in rows
+    assert "attitude" in rows
+
+
+def test_what_an_earlier_call_has_written_is_told(tmp_path):
+    pytest.importorskip("h5py")
+    robot = fflin.load("planar_detumble")
+    call = {"runs": 4, "duration": 0.1, "dt": 0.05, "engine": "python", "out": tmp_path / "a.h5"}
+    first = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
+    again = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
+    assert again.notes[: len(first.notes)] == first.notes
+    assert "none was simulated again" in again.notes[-1]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_shows_the_progress_of_runs(monkeypatch, terminal):
+    class Stderr(io.StringIO):
+        def isatty(self):
+            return terminal
+
+    monkeypatch.setattr(process, "_PATIENCE", 0.0)
+    monkeypatch.setattr(process, "_INTERVAL", 0.0)
+    monkeypatch.setattr(sys, "stderr", Stderr())
+    robot = fflin.load("planar_detumble")
+    call = {"runs": 16, "duration": 0.1, "dt": 0.05, "engine": "python", "chunk": 8}
+    fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
+    assert ("50%" in sys.stderr.getvalue()) == terminal
+
+
+def test_a_resumed_campaign_says_how_many_runs_it_keeps(tmp_path):
+    pytest.importorskip("h5py")
+    robot = fflin.load("planar_detumble")
+    call = {"runs": 24, "duration": 0.1, "dt": 0.05, "engine": "python", "chunk": 8}
+    call["out"] = tmp_path / "a.h5"
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fflin.monte_carlo(robot, None, {"q_b": 0.02}, progress=stop, **call)
+    campaign = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
+    assert campaign.notes[-1] == "8 of 24 runs are from the unfinished file of an earlier call"

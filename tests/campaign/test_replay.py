@@ -111,3 +111,43 @@ def test_a_run_on_oblique_axes_is_repeated_bit_for_bit(oblique, engine, runs):
         motion = campaign.replay(run)
         for name in ("q", "v", "u"):
             assert np.array_equal(getattr(motion, name)[-1], getattr(campaign, name)[run]), name
+
+
+def _pushed(t, q, v):
+    return np.full(len(v), 1e-3)
+
+
+def test_a_run_of_a_file_is_repeated_bit_for_bit(oblique, tmp_path):
+    robot, policy = oblique
+    spreads = {**SPREADS, "*.mass": {"range": 0.05, "tied": True}, "q_b.noise": 1e-3}
+    options = {
+        **OPTIONS,
+        "sample": 0.04,
+        "limits": {"tau_b": 5.0},
+        "v0": np.full(robot.nv, 1e-2),
+        "disturbance": _pushed,
+    }
+    made = fflin.monte_carlo(robot, policy, spreads, runs=3, engine="python", **options)
+    made.save(tmp_path / "runs.npz")
+    loaded = fflin.Campaign.load(tmp_path / "runs.npz")
+    with pytest.raises(fflin.InputError, match="disturbance="):
+        loaded.replay(2, robot=robot, policy=policy)
+    motion = loaded.replay(2, robot=robot, policy=policy, disturbance=_pushed)
+    same = made.replay(2)
+    for name in ("q", "v", "u"):
+        assert np.array_equal(getattr(motion, name), getattr(same, name)), name
+    half = fflin.StateFeedback(policy.lin, 0.5 * policy.K)
+    with pytest.warns(fflin.FflinWarning, match="differs"):
+        loaded.replay(2, robot=robot, policy=half, disturbance=_pushed)
+
+
+def test_runs_of_another_robot_are_not_repeated(oblique, tmp_path):
+    robot, policy = oblique
+    made = fflin.monte_carlo(robot, policy, {"q_b": 0.01}, runs=1, engine="python", **OPTIONS)
+    made.save(tmp_path / "runs.npz")
+    loaded = fflin.Campaign.load(tmp_path / "runs.npz")
+    with pytest.raises(fflin.InputError, match="another URDF"):
+        loaded.replay(0, robot=fflin.load("cubesat"), policy=policy)
+    fewer = robot.replace(appendages=[])
+    with pytest.raises(fflin.InputError, match="not that of the campaign"):
+        loaded.replay(0, robot=fewer, policy=None)
