@@ -3,7 +3,7 @@
 import json
 import math
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import fields, replace
@@ -16,7 +16,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.record import content_digest, reading
-from fflin.base.validation import instance, share, truth, whole
+from fflin.base.validation import Array, instance, share, truth, whole
 from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
@@ -234,34 +234,60 @@ def monte_carlo(
             texts = {"header": json.dumps(header)}
             store = files.FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
-    made = partial(Campaign.of, header=header, job=job)
     with closing(store), how:
         expect(how.progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
-        done = runs if until is None else min(_STAGE, runs)
-        resumed: int | None = None  # number of runs that an interrupted call has left in the file
-        while True:
-            kept = run_chunks(
-                job, job.rows, store, how, how.progress, of_what="runs", made=made, upto=done
-            )
-            if resumed is None:
-                resumed = kept
-            if done == runs:
-                break
-            found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
-            if found.high - found.low <= width:
-                break
-            done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
-        for start in range(done, runs, store.chunk):  # runs that `until` has made unnecessary
-            stop = min(start + store.chunk, runs)
-            unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
-            store.write(start, stop, unused)
+        enough = None
+        if until is not None:
+            enough = partial(_is_narrow, header, until, width, confidence)
+        resumed = _computed(job, store, how, header, enough)
         campaign = Campaign.of(store.complete(), header, job)
-        if resumed:
-            note = f"{resumed:,} of {runs:,} runs are from the unfinished file of an earlier call"
-            campaign = replace(campaign, notes=(*campaign.notes, note))
+    if resumed:
+        note = f"{resumed:,} of {runs:,} runs are from the unfinished file of an earlier call"
+        campaign = replace(campaign, notes=(*campaign.notes, note))
     if path and path.suffix == ".npz":
         campaign._save(path, request=request)
     return campaign
+
+
+def _computed(
+    job: CampaignJob,
+    store: files.MemoryStore | files.FileStore,
+    how: Execution,
+    header: Mapping[str, object],
+    enough: Callable[[dict[str, Array]], bool] | None,
+) -> int:
+    """Compute the runs of a store, and return how many of them it has from an earlier call.
+
+    If `enough` is given, runs are computed in stages until it returns True for the arrays of the
+    computed runs. The rows of the other runs are marked as not run.
+    """
+    runs = store.count
+    made = partial(Campaign.of, header=header, job=job)
+    done = runs if enough is None else min(_STAGE, runs)
+    resumed = run_chunks(
+        job, job.rows, store, how, how.progress, of_what="runs", made=made, upto=done
+    )
+    while enough is not None and done < runs and not enough(store.read(done)):
+        done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
+        run_chunks(job, job.rows, store, how, how.progress, of_what="runs", made=made, upto=done)
+    shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
+    for start in range(done, runs, store.chunk):
+        stop = min(start + store.chunk, runs)
+        unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+        store.write(start, stop, unused)
+    return resumed
+
+
+def _is_narrow(
+    header: Mapping[str, object],
+    until: str,
+    width: float,
+    confidence: float,
+    arrays: dict[str, Array],
+) -> bool:
+    """Return whether the confidence interval of a condition is at most `width` wide."""
+    found = Campaign.of(arrays, header).fraction(until, confidence=confidence)
+    return found.high - found.low <= width
 
 
 def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:

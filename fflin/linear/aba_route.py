@@ -19,8 +19,8 @@ from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
 # To sample their rounding errors, the ABA derivatives are computed again at _SAMPLES points that
-# differ by _NUDGE. This changes the exact derivatives by about as much as ten units in the last place
-# of the arguments.
+# differ by _NUDGE. This changes the exact derivatives by about as much as ten units in the last
+# place of the arguments.
 _NUDGE, _SAMPLES = 1e-14, 3
 
 

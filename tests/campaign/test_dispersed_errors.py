@@ -1,9 +1,8 @@
 """Inputs that are misaligned, noise of what is sensed, and delays that are drawn."""
 
-from itertools import product
-
 import os
 import signal
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
