@@ -72,7 +72,12 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     first = {"passive": given.pop("passive")} if "passive" in given else {}
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
-    robot = fflin.load(arguments.robot, lock=once("--lock", arguments.lock), **first)
+    robot = fflin.load(
+        arguments.robot,
+        lock=once("--lock", arguments.lock),
+        xacro=once("--xacro", arguments.xacro),
+        **first,
+    )
     for name in [each for each in ("stiffness", "damping") if each in given]:
         for_all = [value for joint, value in given[name] if joint is None]
         if for_all and len(given[name]) > 1:

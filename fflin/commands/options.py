@@ -11,7 +11,7 @@ TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
 _INPUTS = "effort equilibrium relative-equilibrium"
-_SYSTEM = "lock orbit stiffness damping gravity passive inputs output"
+_SYSTEM = "lock xacro orbit stiffness damping gravity passive inputs output"
 _TRAJECTORY = "trajectory hold strict"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
 _SCENE = "scene tool follow"
@@ -39,7 +39,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "view": {
         "": "ROBOT",
         POINT: _POSE,
-        ROBOT: "lock orbit",
+        ROBOT: "lock xacro orbit",
         OUTPUT: f"frame {_SCENE} no-open port",
     },
     "linearize": {**_AT_POINT, OUTPUT: "dt for output-file plot", TRAJECTORY: _TRAJECTORY},
@@ -174,6 +174,7 @@ ABOUT: dict[str, str] = {
     "pose at the operating point (base, default), or the world frame (world)",
     "lock": "lock a joint at VALUE [rad|m]. Without VALUE, the joint is locked at its neutral "
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
+    "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m] above a central body: earth (default), moon, mars "
     "... The world is then the orbital frame",
     "stiffness": "stiffness of a joint [N m/rad|N/m], or one value for all joints",

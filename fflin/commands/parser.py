@@ -98,6 +98,14 @@ def lock(text: str) -> tuple[str, float | None]:
     return assignment(text) if "=" in text else (text, None)
 
 
+def xacro_argument(text: str) -> tuple[str, str]:
+    """Read NAME=VALUE, the value of an argument of a xacro file."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=VALUE, such as arm=long")
+    return name, value
+
+
 def orbit(text: str) -> dict[str, float | str]:
     """Read ALTITUDE or ALTITUDE:BODY."""
     altitude, _, body = text.partition(":")
@@ -189,6 +197,7 @@ FORMS: dict[str, Form] = {
     "show": _NAMES,
     "output": many(str, "SPEC"),
     "lock": many(lock, "NAME[=VALUE]"),
+    "xacro": many(xacro_argument, "NAME=VALUE"),
     "vary": many(parameter_range, "NAME=RANGE", required=True),
     "grid": many(grid_axis, "JOINT=LO:HI:N"),
     "range": many(joint_range, "JOINT=LO:HI"),

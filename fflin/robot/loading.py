@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
 from fflin.base.toml_file import TomlFile, flat
-from fflin.base.validation import instance, is_rotation, rotated
+from fflin.base.validation import by_name, instance, is_rotation, rotated
 from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
@@ -43,7 +43,7 @@ _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
 # Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
 KEYS = (
-    *("urdf", "package_dirs", "lock"),
+    *("urdf", "package_dirs", "xacro", "lock"),
     *(table for tables in _TABLES.values() for table in tables),
     *(name for name in FIELDS if name not in _TABLES),
 )
@@ -56,6 +56,7 @@ def load(
     *,
     lock: Lock | None = None,
     package_dirs: Sequence[str | Path] = (),
+    xacro: Mapping[str, object] | None = None,
     **fields: object,
 ) -> Robot:
     """Load a robot as a free flyer, by default in zero gravity.
@@ -73,6 +74,9 @@ def load(
     package_dirs : sequence of path
         Folders to search for ``package://`` meshes when the robot is drawn. They are searched
         before the folders that contain the URDF.
+    xacro : mapping, optional
+        Arguments of a xacro file, as {name: value}: the values of its ``<xacro:arg>``. They take
+        precedence over the table ``[xacro]`` of the robot file.
     **fields
         Fields of the robot: inputs, outputs, appendages, stiffness, damping, rest, gravity, orbit,
         limits, passive, weights, point, target and start; see `Robot.replace`. Fields given here
@@ -110,13 +114,16 @@ def load(
     8
     """
     found, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
+    arguments = _xacro_arguments(xacro)
     document, later, of_file = None, dict[str, float | None](), dict[str, object]()
     if found.path.suffix.lower() == ".toml":
         document, found, of_file = _read_robot_file(found)
         with document.located("lock"):
             own = requested(of_file.pop("lock", ()))
+        with document.located("xacro"):
+            arguments = _xacro_arguments(of_file.pop("xacro", None)) | arguments
         later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
-    urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path)
+    urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path, arguments)
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
     dirs = (*dirs, *found.package_dirs)
@@ -129,6 +136,7 @@ def load(
         urdf_sha256=urdf.sha256,
         notes=urdf.notes,
         package_dirs=dirs,
+        xacro=arguments,
         links={
             name: LinkMass(link.mass, link.inertia, link.com.placement)
             for name, link in urdf.links.items()
@@ -409,7 +417,20 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
         values["appendages"] = appendages
     # The robot is named after the TOML file, not after the URDF.
     found = found._replace(name=file.name, package_dirs=dirs)
-    return document, found, {key: values[key] for key in ("lock", *FIELDS) if key in values}
+    keys = ("lock", "xacro", *FIELDS)
+    return document, found, {key: values[key] for key in keys if key in values}
+
+
+def _xacro_arguments(given: object) -> dict[str, str]:
+    """Return the arguments {name: text} of a xacro file, as ROS writes them on a command line."""
+    texts = dict[str, str]()
+    for name, value in by_name("xacro", {} if given is None else given, "argument").items():
+        if not isinstance(value, str | bool | int | float):
+            raise InputError(
+                f"xacro argument '{name}' is {value!r}, expected a text, a number or a boolean"
+            )
+        texts[name] = str(value).lower() if isinstance(value, bool) else str(value)
+    return texts
 
 
 def _read_inputs(document: TomlFile) -> tuple[Input, ...]:

@@ -88,6 +88,8 @@ class Robot(Coordinates):
         Orbit of the robot. In orbit, Pinocchio's world is the orbital frame, see `CircularOrbit`.
     package_dirs : tuple of Path
         Folders that are searched for ``package://`` meshes when the robot is drawn.
+    xacro : mapping
+        Arguments {name: text} with which a xacro file was expanded.
     passive : tuple of str
         Joints without a motor.
     wheel_joints : tuple of str
@@ -135,6 +137,7 @@ class Robot(Coordinates):
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orbit: CircularOrbit | None = None
     package_dirs: tuple[Path, ...] = ()
+    xacro: Mapping[str, str] = field(default_factory=dict)
     passive: tuple[str, ...] = ()
     wheel_joints: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)

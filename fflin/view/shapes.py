@@ -90,7 +90,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     path = robot.urdf
     assert path is not None
     try:
-        root, _ = plain_root(read_file(path, "URDF", SIZE_LIMIT), path)
+        root, _ = plain_root(read_file(path, "URDF", SIZE_LIMIT), path, robot.xacro)
     except FflinError as error:
         notes.append(f"no visual geometry: {error}")
         return

@@ -1,18 +1,20 @@
 """Reader of URDF and xacro files, which builds a Pinocchio model with a free-flyer root joint."""
 
 import hashlib
+import json
 import sys
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import MissingPackageError, UrdfError
+from fflin.base.errors import InputError, MissingPackageError, UrdfError, listed, require_known
 from fflin.base.process import import_path_without
 from fflin.base.writing import remember
 from fflin.robot.urdf import description
@@ -26,6 +28,8 @@ SIZE_LIMIT = 64 * 2**20  # bytes
 _STACK = 16 * 2**20
 
 _UNBOUNDED = {"lower": -UNLIMITED, "upper": UNLIMITED}
+
+NO_ARGUMENTS: Mapping[str, str] = MappingProxyType({})
 
 # Characters that must be escaped in the values of XML attributes.
 _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
@@ -48,7 +52,7 @@ class Urdf(NamedTuple):
     """Checked content of a robot's file."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
-    sha256: str  # digest of the file that was read, without files that a xacro includes
+    sha256: str  # digest of the file and of the xacro arguments, without included files
     links: dict[str, Link]  # in the order of the file
     joints: dict[str, JointElement]
     mimics: dict[str, Mimic]  # {mimic joint: Mimic} with independent leaders
@@ -56,9 +60,12 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # warnings, one line each
 
 
-def describe(document: bytes, path: Path) -> Urdf:
-    """Read a URDF or xacro file; `document` contains the bytes of the file at `path`."""
-    root, notes = plain_root(document, path)
+def describe(document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Urdf:
+    """Read a URDF or xacro file; `document` contains the bytes of the file at `path`.
+
+    `arguments` are the values {name: text} of the arguments of a xacro file.
+    """
+    root, notes = plain_root(document, path, arguments)
     links, joints = description.read_tree(root)
     mimics = description.resolve_mimics(joints)
     # The position of a continuous joint does not count full turns, but the position of a revolute
@@ -97,11 +104,15 @@ def describe(document: bytes, path: Path) -> Urdf:
     model.name = name or path.stem.encode(errors="backslashreplace").decode()
     notes += [*notes_of(root), *description.inertia_notes(links.values(), model, path.stem)]
     meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
-    digest = hashlib.sha256(document).hexdigest()
-    return Urdf(model, digest, links, joints, mimics, meshes, tuple(notes))
+    digest = hashlib.sha256(document)
+    if arguments:
+        digest.update(json.dumps(dict(arguments), sort_keys=True).encode())
+    return Urdf(model, digest.hexdigest(), links, joints, mimics, meshes, tuple(notes))
 
 
-def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
+def plain_root(
+    document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGUMENTS
+) -> tuple[Element, list[str]]:
     """Parse a document, and expand it if it uses xacro; return its root and xacro's messages."""
     root = parse(document, str(path))
     # To save time, search the elements for xacro only if the document contains text that may belong
@@ -111,8 +122,13 @@ def plain_root(document: bytes, path: Path) -> tuple[Element, list[str]]:
     elements = chain([root], root.iterate(_IGNORED)) if suspect else ()
     first = next(filter(_uses_xacro, elements), None)
     if path.suffix != ".xacro" and not first:
+        if arguments:
+            raise InputError(
+                f"xacro arguments are given ({listed(arguments)}), but {path} does not use xacro; "
+                "remove them"
+            )
         return root, []
-    expanded, notes = _expand(path, document, first)
+    expanded, notes = _expand(path, document, first, arguments)
     return parse(expanded, f"{path} as expanded by xacro"), notes
 
 
@@ -188,12 +204,13 @@ def _tag(tag: str, attributes: Mapping[str, object], inside: str = "") -> str:
     return f"{text}>{inside}</{tag}>"
 
 
-def _expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
+def _expand(
+    path: Path, document: bytes, first: Element | None, arguments: Mapping[str, str]
+) -> tuple[bytes, list[str]]:
     """Expand a xacro document, and return the plain URDF and xacro's messages.
 
     `first` is the first element that uses xacro, or None. It appears in error messages.
     """
-    import json
     import subprocess
     from importlib.util import find_spec
 
@@ -207,7 +224,13 @@ def _expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, 
     child = [sys.executable, "-I", "-X", "utf8", "-W", "ignore", _CHILD]
     try:
         done = subprocess.run(
-            [*child, str(path), str(XACRO_LIMIT), *import_path_without("", path.parent)],
+            [
+                *child,
+                str(path),
+                str(XACRO_LIMIT),
+                json.dumps(dict(arguments)),
+                *import_path_without("", path.parent),
+            ],
             input=document,
             capture_output=True,
             timeout=XACRO_LIMIT,
@@ -222,6 +245,8 @@ def _expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, 
     if done.returncode:
         why = " ".join(said[-1:]) or f"its process ended with exit code {done.returncode}"
         raise UrdfError(f"{failed}: {why[:300]}")
-    files, _, urdf = done.stdout.partition(b"\n")
-    remember(*json.loads(files))
+    line, _, urdf = done.stdout.partition(b"\n")
+    head = json.loads(line)
+    remember(*head["files"])
+    require_known(f"xacro argument of {path.name}", arguments, head["arguments"])
     return urdf, [f"{path.name}: {line}" for line in said if line]

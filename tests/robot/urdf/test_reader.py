@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.commands.cli import main
 from fflin.robot.urdf import reader as expansion
 from fflin.robot.urdf.description import Mimic
 from fflin.robot.urdf.reader import describe, ignored
@@ -354,3 +355,45 @@ def test_a_note_is_told_once_for_all_its_lines():
 def test_limit_given_is_the_limit():
     model = read(arm(inside=AXIS + LIMIT)).model
     assert (model.lowerPositionLimit[7], model.upperPositionLimit[7]) == (-1.0, 1.0)
+
+
+def _with_an_argument(folder):
+    """A xacro file whose arm has the mass of the argument `arm`, and a robot file that sets it."""
+    namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    declared = '<xacro:arg name="arm" default="3"/>'
+    path = folder / "r.xacro"
+    path.write_text(
+        arm(child=inertial("$(arg arm)"), attributes=f'name="r" {namespace}').replace(
+            "<link", f"{declared}<link", 1
+        )
+    )
+    toml = folder / "r.toml"
+    toml.write_text('urdf = "r.xacro"\n[xacro]\narm = 5\n')
+    return path, toml
+
+
+@pytest.mark.process
+def test_arguments_of_xacro_are_given_in_python_and_in_robot_files(tmp_path):
+    pytest.importorskip("xacrodoc")
+    path, toml = _with_an_argument(tmp_path)
+    cases = {
+        3.0: fflin.load(path),
+        4.0: fflin.load(path, xacro={"arm": 4}),
+        5.0: fflin.load(toml),
+        6.5: fflin.load(toml, xacro={"arm": "6.5"}),
+    }
+    for mass, robot in cases.items():
+        assert robot.model.inertias[2].mass == mass
+    assert len({robot.urdf_sha256 for robot in cases.values()}) == 4
+    with pytest.raises(fflin.UnknownNameError, match="arn"):
+        fflin.load(path, xacro={"arn": 4})
+    assert main(["info", str(path), "--xacro", "arm=4"]) == 0
+
+
+def test_arguments_of_xacro_need_a_xacro_file(tmp_path):
+    path = tmp_path / "r.urdf"
+    path.write_text(arm())
+    with pytest.raises(fflin.InputError, match="does not use xacro"):
+        fflin.load(path, xacro={"arm": 4})
+    with pytest.raises(fflin.InputError, match="a text, a number or a boolean"):
+        fflin.load(path, xacro={"arm": [4]})
