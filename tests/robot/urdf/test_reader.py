@@ -382,9 +382,9 @@ def test_arguments_of_xacro_are_given_in_python_and_in_robot_files(tmp_path):
         5.0: fflin.load(toml),
         6.5: fflin.load(toml, xacro={"arm": "6.5"}),
     }
-    for mass, robot in cases.items():
-        assert robot.model.inertias[2].mass == mass
-    assert len({robot.urdf_sha256 for robot in cases.values()}) == 4
+    for mass, loaded in cases.items():
+        assert loaded.model.inertias[2].mass == mass
+    assert len({each.urdf_sha256 for each in cases.values()}) == 4
     with pytest.raises(fflin.UnknownNameError, match="arn"):
         fflin.load(path, xacro={"arn": 4})
     assert main(["info", str(path), "--xacro", "arm=4"]) == 0
