@@ -415,7 +415,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
                 "validity",
                 "ets_vii",
                 "--samples",
-                "900000",
+                "90000",
                 "--jobs",
                 jobs,
             ],
