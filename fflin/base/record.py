@@ -190,14 +190,29 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        hint = ", but of version 7.3; save it with save -v7" * (content[124:128] == b"\0\2IM")
-        raise ValueError(f"not a MATLAB file of level 5{hint}")
+        raise ValueError(f"{_other_format(content)}; save it with save -v7 (MATLAB and Octave)")
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
+def _other_format(content: bytes) -> str:
+    """Describe a file with the ending .mat that is not of MATLAB's level 5."""
+    if content[124:128] == b"\0\2IM":
+        return "a MATLAB file of version 7.3"
+    if content.startswith(b"\x89HDF"):
+        return "an HDF5 file"
+    if content.startswith((b"# Created by Octave", b"Octave-1")):
+        return "a file of Octave's own format"
+    return "not a MATLAB file of level 5"
+
+
 def _of_mat(value: object) -> object:
-    """Convert a MATLAB variable: text to str, cells or text rows to a list, a struct to a dict."""
+    """Convert a MATLAB variable.
+
+    Text becomes a str, cells or text rows a list, a struct a dict, and a sparse matrix an array.
+    """
+    if hasattr(value, "toarray"):
+        return value.toarray()
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.names:

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import fflin
 from fflin.base.record import CODECS, content_digest, read_record, write_record
@@ -339,3 +340,26 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
         made("batch").save(path)
         assert fflin.LinearBatch.load(path).verified
         assert not fflin.LinearBatch.load(path, verify=False).verified
+
+
+@pytest.mark.parametrize(
+    ("content", "format_"),
+    [
+        (b"# Created by Octave 7.3.0\n# name: A\n# type: matrix\n", "Octave's own format"),
+        (b"Octave-1-L", "Octave's own format"),
+        (b"\x89HDF\r\n\x1a\n", "HDF5"),
+    ],
+)
+def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(tmp_path, content, format_):
+    (tmp_path / "x.mat").write_bytes(content.ljust(200, b" "))
+    with pytest.raises(fflin.FileError, match=rf"{format_}; save it with save -v7"):
+        fflin.Gain.load(tmp_path / "x.mat")
+
+
+def test_sparse_matrices_of_matlab_are_read(tmp_path):
+    from scipy.io import savemat
+
+    A = np.diag([1.0, 0.0, -2.0])
+    savemat(tmp_path / "x.mat", {"A": scipy.sparse.csc_matrix(A)})
+    found, _ = read_record(tmp_path / "x.mat")
+    assert np.array_equal(found["A"], A)

@@ -56,6 +56,9 @@ _LINK_LIMIT = 10_000
 # Attributes of <inertia>, which are the entries of the upper triangle of the matrix, row by row.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
+# Entries below the diagonal, which some programs also write, with the equal entries above it.
+_BELOW_DIAGONAL = {"iyx": "ixy", "izx": "ixz", "izy": "iyz"}
+
 
 class Pose(NamedTuple):
     """Placement of a frame in another frame, in the form in which the file gives it."""
@@ -120,7 +123,14 @@ def read_link(name: str, element: Element) -> Link:
     if inertial is None:
         return Link(name, element)
     inertial.refuse_near_miss("origin", "mass", "inertia")
-    weight, inertia = inertial.require("mass", "value"), inertial.require("inertia", *INERTIA)
+    weight = inertial.require("mass", "value")
+    inertia = inertial.require("inertia", *INERTIA, *_BELOW_DIAGONAL)
+    for below, above in _BELOW_DIAGONAL.items():
+        if below in inertia.attributes and inertia.number(below) != inertia.number(above):
+            raise inertia.error(
+                f"{below} of {inertia.title} is {inertia.number(below):g}, but {above} is "
+                f"{inertia.number(above):g}; an inertia is symmetric, so make them equal"
+            )
     mass = weight.number("value")
     if mass < 0.0:
         raise weight.error(f"{weight.title} is {mass:g} kg, expected 0 or more; correct it")

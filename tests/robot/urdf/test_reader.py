@@ -397,3 +397,14 @@ def test_arguments_of_xacro_need_a_xacro_file(tmp_path):
         fflin.load(path, xacro={"arm": 4})
     with pytest.raises(fflin.InputError, match="a text, a number or a boolean"):
         fflin.load(path, xacro={"arm": [4]})
+
+
+def test_inertias_may_be_written_in_full():
+    full = 'iyx="0.1" izx="0.2" izy="0.3" ixy="0.1" ixz="0.2" iyz="0.3"'
+    written = '<inertia ixx="2" iyy="2" izz="2" {}/>'
+    text = arm(child=inertial("1").replace(INERTIA, written.format(full)))
+    inertia = read(text).links["arm"].inertia
+    expected = [[2.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 2.0]]
+    assert inertia.tolist() == expected
+    with pytest.raises(fflin.UrdfError, match=r"izx .* is 0\.5, but ixz is 0\.2"):
+        read(text.replace('izx="0.2"', 'izx="0.5"'))
