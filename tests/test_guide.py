@@ -110,6 +110,29 @@ def test_pages_are_short():
 
 @pytest.mark.docs
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")
+def test_octave_makes_a_system_of_a_saved_model(tmp_path):
+    (block,) = re.findall(r"^```octave\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
+    lin = fflin.linearize(fflin.load("servicer_7dof"))
+    lin.save(tmp_path / "model.mat")
+    (tmp_path / "read.m").write_text(
+        "if isempty(pkg('list', 'control')), disp('no package control'), exit, end\n"
+        + block[: block.index("bode")]
+        + "printf('%d %d %d %s\\n', size(sys), isct(sys), sys.stname{8});\n"
+    )
+    done = subprocess.run(
+        ["octave", "--no-gui", "--quiet", "read.m"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "no package control" in done.stdout:
+        pytest.skip("needs Octave's package control")
+    assert done.stdout == f"30 15 1 {lin.state_names[7]}\n", done.stderr
+
+
+@pytest.mark.docs
+@pytest.mark.skipif(not which("octave"), reason="needs Octave")
 def test_octave_reads_a_saved_model(tmp_path):
     block, _ = re.findall(r"^```matlab\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
     robot = fflin.load("servicer_7dof")
