@@ -412,13 +412,12 @@ def energies_of(
     bodies = {i for i in range(len(names)) if i + ROOT not in carriers}
     found: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
     for of_bodies, of_springs in zip(kinetic.T, elastic.T, strict=True):
-        of_bodies /= of_bodies.sum() or 1.0
-        order = np.argsort(-of_bodies.round(9), kind="stable").tolist()
-        energy = {names[i]: float(of_bodies[i]) for i in order if i in bodies}
-        of_springs /= of_springs.sum() or 1.0
-        order = np.argsort(-of_springs, kind="stable").tolist()
-        bent = [i for i in order if of_springs[i] > 0.0]
-        strain = {robot.joint_names[i]: float(of_springs[i]) for i in bent}
+        parts = of_bodies / (of_bodies.sum() or 1.0)
+        order = np.argsort(-parts.round(9), kind="stable").tolist()
+        energy = {names[i]: float(parts[i]) for i in order if i in bodies}
+        parts = of_springs / (of_springs.sum() or 1.0)
+        order = np.argsort(-parts, kind="stable").tolist()
+        strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
         found.append((energy, strain))
     return found
 
