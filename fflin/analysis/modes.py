@@ -12,6 +12,7 @@ from fflin.analysis.mechanics import checked
 from fflin.analysis.ranks import EPS
 from fflin.analysis.reduction import ReducedModel
 from fflin.base.errors import InputError
+from fflin.base.rotation import skew
 from fflin.base.tables import counted, folded, grid, width
 from fflin.base.validation import Array, Complex, FrozenArrays, Values
 from fflin.dynamics.state import StateMap
@@ -328,7 +329,9 @@ def modes(lin: LinearModel) -> Modes:
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
     weight = np.concatenate((fastest * inertia, inertia))
     pairs, rigid_body = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
-    found, residual = list[Mode](), 0.0
+    # Pole, shape and margin of each mode
+    found: list[tuple[complex, Complex, float]] = []
+    residual = 0.0
     for scaled_pole, vector, error in pairs:
         if scaled_pole.imag < 0.0:
             continue
@@ -342,10 +345,15 @@ def modes(lin: LinearModel) -> Modes:
         positions = np.abs(shape[:nv])
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shape, margin = np.asarray(shape / shape[largest], complex), scaled_pole.real / error
-        energies = energies_of(lin._robot, lin, shape)
-        found.append(Mode(pole, shape, margin > 1.0, margin, *energies))
+        found.append((pole, shape, margin))
+    shapes = np.array([shape for _, shape, _ in found], complex).reshape(len(found), 2 * nv)
+    energies = energies_of(lin._robot, lin, shapes)
+    listed = [
+        Mode(pole, shape, margin > 1.0, margin, energy, strain)
+        for (pole, shape, margin), (energy, strain) in zip(found, energies, strict=True)
+    ]
     return Modes(
-        tuple(sorted(found, key=lambda mode: (abs(mode.pole), mode.pole.real))),
+        tuple(sorted(listed, key=lambda mode: (abs(mode.pole), mode.pole.real))),
         rigid_body,
         2 * nv - len(pairs),
         residual,
@@ -374,50 +382,72 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
 
 
 def energies_of(
-    robot: Robot | None, lin: LinearModel, shape: Complex
-) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    robot: Robot | None, lin: LinearModel, shapes: Complex
+) -> list[tuple[Mapping[str, float], Mapping[str, float]]]:
     """Return {body: fraction of the kinetic energy} and {joint: fraction of the elastic energy}.
 
-    `shape` (nx,) is the shape of a mode, see `Mode`. Without a robot, both results are empty.
+    The rows of `shapes` (k, nx) are the shapes of k modes, see `Mode`. The result has one pair of
+    mappings for each mode. Without a robot, all mappings are empty.
     """
     if robot is None:
-        return {}, {}
+        return [({}, {}) for _ in shapes]
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    chart, data = state.chart(lin.q), robot.create_data()
-    names = ("base", *list(robot.model.names)[ROOT + 1 :])
-    moved = shape[: len(shape) // 2]
+    chart = state.chart(lin.q)
+    moved = shapes[:, : shapes.shape[1] // 2].T
     if isinstance(lin, ReducedModel):
         moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
     # The kinetic energy is computed with displacements, in base axes, instead of velocities. In a
     # mode, the velocities are the displacements times the pole, so the fractions are the same.
-    moved = np.concatenate((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
-    terms = sum(_energies(robot, data, lin.q, state.spread(x)) for x in (moved.real, moved.imag))
+    moved = np.vstack((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))
+    parts = np.hstack((moved.real, moved.imag))
+    real, imaginary = np.hsplit(_energies(robot, lin.q, state.spread(parts.T).T), 2)
+    terms = real + imaginary
     # The inertia of a link without its balls is not physically realisable, and its energy alone may
     # be negative. So the energies of all balls and liquids are added to the energy of their link.
     carriers = mode_carriers(robot)
     owners = np.array([carriers.get(i, i) for i in range(ROOT, robot.model.njoints)]) - ROOT
-    kinetic, sizes = np.zeros(len(names)), np.zeros(len(names))
+    kinetic = np.zeros_like(terms)
+    sizes = np.zeros_like(terms)
     np.add.at(kinetic, owners, terms)
     np.add.at(sizes, owners, np.abs(terms))
     kinetic[np.abs(kinetic) <= _ROUNDING * sizes] = 0.0
-    kinetic /= kinetic.sum() or 1.0
-    order = np.argsort(-kinetic.round(9), kind="stable").tolist()
-    energy = {names[i]: float(kinetic[i]) for i in order if i + ROOT not in carriers}
-    elastic = robot.springs.stiffness * np.abs(moved[6:]) ** 2
-    elastic /= elastic.sum() or 1.0
-    order = np.argsort(-elastic, kind="stable").tolist()
-    return energy, {robot.joint_names[i]: float(elastic[i]) for i in order if elastic[i] > 0.0}
+    elastic = robot.springs.stiffness[:, None] * np.abs(moved[6:]) ** 2
+    names = ("base", *list(robot.model.names)[ROOT + 1 :])
+    bodies = {i for i in range(len(names)) if i + ROOT not in carriers}
+    found: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
+    for of_bodies, of_springs in zip(kinetic.T, elastic.T, strict=True):
+        parts = of_bodies / (of_bodies.sum() or 1.0)
+        order = np.argsort(-parts.round(9), kind="stable").tolist()
+        energy = {names[i]: float(parts[i]) for i in order if i in bodies}
+        parts = of_springs / (of_springs.sum() or 1.0)
+        order = np.argsort(-parts, kind="stable").tolist()
+        strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
+        found.append((energy, strain))
+    return found
 
 
-def _energies(robot: Robot, data: pin.Data, q: Array, v: Array) -> Array:
-    """Return twice the kinetic energy of each body, with the rotor of its joint, at q and v."""
-    model = robot.model
-    pin.forwardKinematics(model, data, q, v)
-    bodies = zip(model.inertias.tolist(), data.v.tolist(), strict=True)
-    energies = np.array([body.vtiv(V) for body, V in bodies])
+def _energies(robot: Robot, q: Array, v: Array) -> Array:
+    """Return twice the kinetic energy (bodies, k) of each body, with the rotor of its joint.
+
+    The columns of v (nv, k) are k velocities at the configuration q.
+    """
+    # The twists of all k motions are propagated together, from each body to the next. This needs a
+    # single pin.Data, whose construction costs more than the rest of this function.
+    model, data = robot.model, robot.create_data()
+    pin.forwardKinematics(model, data, q, np.zeros(model.nv))
+    twists = np.zeros((model.njoints, 6, v.shape[1]))
+    energies = np.zeros((model.njoints, v.shape[1]))
     for index in range(ROOT, model.njoints):
-        rates = slice(model.idx_vs[index], model.idx_vs[index] + model.nvs[index])
-        energies[index] += model.armature[rates] @ v[rates] ** 2
+        body = model.inertias[index]
+        rates = v[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]]
+        armature = model.armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]]
+        twist = twists[index]
+        twist[:] = np.asarray(data.joints[index].S).reshape(6, -1) @ rates
+        twist += data.liMi[index].toActionMatrixInverse() @ twists[model.parents[index]]
+        angular = twist[3:]
+        linear = twist[:3] - skew(body.lever) @ angular
+        energies[index] = body.mass * (linear**2).sum(axis=0) + armature @ rates**2
+        energies[index] += (angular * (body.inertia @ angular)).sum(axis=0)
     return energies[ROOT:]
 
 

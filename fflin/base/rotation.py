@@ -67,15 +67,16 @@ def conjugate(a: Array) -> Array:
 
 def rotation_matrix(a: Array) -> Array:
     """Return the rotation (3, 3) of a unit quaternion."""
-    return np.array(_rotation(*a.tolist()))
+    return np.array(rotation_rows(*a.tolist()))
 
 
 def rotation_matrices(a: Array) -> Array:
     """Return the rotations (N, 3, 3) of unit quaternions (N, 4)."""
-    return np.ascontiguousarray(np.array(_rotation(*a.T)).transpose(2, 0, 1))
+    return np.ascontiguousarray(np.array(rotation_rows(*a.T)).transpose(2, 0, 1))
 
 
-def _rotation(x: T, y: T, z: T, w: T) -> tuple[tuple[T, T, T], ...]:
+def rotation_rows(x: T, y: T, z: T, w: T) -> tuple[tuple[T, T, T], ...]:
+    """Return the rows of the rotation of a unit quaternion, from numbers or from arrays (N,)."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.integrals import screw_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -229,7 +230,7 @@ def batch_tree(robot: Robot) -> Tree | None:
         return None
     model = robot.model
     joints = model.joints.tolist()[ROOT:]
-    screws = [_screw(model, joint) for joint in joints[1:]]
+    screws = [screw_of(model, joint) for joint in joints[1:]]
     if None in screws:
         return None
     places, turns, slides = zip((pin.SE3.Identity(), 0.0, 0.0), *screws, strict=True)
@@ -304,32 +305,6 @@ def batch_tree(robot: Robot) -> Tree | None:
         np.array(robot.springs.damping),
         *np.cumsum([0, *sizes]).tolist(),
     )
-
-
-def _screw(model: pin.Model, joint: pin.JointModel) -> tuple[pin.SE3, float, float] | None:
-    """Return a frame with z along a joint's axis, and the joint's rotation and translation.
-
-    Rotation about z and translation along z are per unit of the joint position. Return None if the
-    joint is not a screw joint; see `batch_tree`.
-    """
-    data = joint.createData()
-    q, v = pin.neutral(model), np.zeros(model.nv)
-    joint.calc(data, q)
-    subspace = np.asarray(data.S).reshape(6)
-    v[joint.idx_v] = 0.7
-    joint.calc(data, pin.integrate(model, q, v))
-    if not data.M.isApprox(pin.exp6(0.7 * subspace), 1e-12):
-        return None
-    linear, angular = subspace[PIN_LINEAR], subspace[PIN_ANGULAR]
-    turn = float(np.linalg.norm(angular))
-    axis = angular / turn if turn else linear / np.linalg.norm(linear)
-    slide = float(linear @ axis)
-    # The axis must pass through the origin of the joint's frame, as for all screw joints of
-    # Pinocchio.
-    if np.abs(linear - slide * axis).max() > 1e-12:
-        return None
-    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
-    return pin.SE3(rotation.normalized().matrix(), np.zeros(3)), turn, slide
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:

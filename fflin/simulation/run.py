@@ -23,6 +23,7 @@ from fflin.base.process import Progress
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, ArrayLike, as_double, vector
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.integrals import integrals
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
@@ -270,24 +271,9 @@ class Conserved:
         integral and five zeros. The bounds are replaced by the size of the largest terms of the
         Jacobi integral and a zero.
         """
-        model, data, robot = self._model, self._data, self._robot
-        rows, near = len(q), q.copy()
+        robot, rows, near = self._robot, len(q), q.copy()
         near[:, :7] -= self._start
-        energy, center, potential = np.empty(rows), np.empty((rows, 3)), np.zeros(rows)
-        momentum, polar = np.empty((rows, 6)), np.empty(rows)
-        for i, (q_i, v_i) in enumerate(zip(near, v, strict=True)):
-            energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
-            pin.ccrba(model, data, q_i, v_i)
-            # `ccrba` also computes the momentum about the centre of mass, but from sums about the
-            # origin, which have larger rounding errors.
-            momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
-            center[i] = data.com[0]
-            polar[i] = 0.5 * np.trace(data.Ig.inertia) + self.mass * center[i].dot(center[i])
-            if self._stored:
-                momentum[i, 3:] += self._of_wheels()
-            if self._field:
-                pin.forwardKinematics(model, data, q[i])
-                potential[i] = self._field.potential(data)
+        energy, momentum, center, polar = integrals(robot, near, v)
         sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
         scale = sizes.max(axis=0)
         for _, stored in self._stored:
@@ -296,15 +282,22 @@ class Conserved:
             energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
         stiffness, _, rest = robot.springs
         if stiffness.any():
-            positions = [[joint.value(q_i) for joint in robot.joints] for q_i in q]
-            energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
+            positions = np.column_stack([joint.values(q.T) for joint in robot.joints])
+            energy += 0.5 * (positions - rest) ** 2 @ stiffness
         p, about_center = np.split(momentum, 2, axis=1)
         kept = np.hstack((p, about_center + np.cross(center, p)))
         if self._field:
+            potential = np.array([self._potential(q_i) for q_i in q])
             scale = np.array([(np.abs(energy) + np.abs(potential)).max(), 0.0])
             energy += potential
             kept = np.column_stack((energy, np.zeros((rows, 5))))
         return energy, momentum, center, kept, scale
+
+    def _potential(self, q: Array) -> float:
+        """Return the potential energy [J] of the orbit at q."""
+        assert self._field is not None
+        pin.forwardKinematics(self._model, self._data, q)
+        return self._field.potential(self._data)
 
     def _of_wheels(self) -> Array:
         """Return the stored momentum (3,) of wheels in world axes, at the link poses in `_data`."""

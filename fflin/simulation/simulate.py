@@ -457,6 +457,11 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         parts = math.ceil(max(1.0, fastest * dt / _PART))
     A, forced = held_exponential(A, np.hstack((B, f0)), dt)
     B, f0 = forced[:, :-1], forced[:, -1]
+    if not (sample or cuts):
+        found = _affine_motion(A, f0, e, steps, every)[: len(x)]
+        if len(found) == len(x) and np.isfinite(found).all():
+            return (found + x0)[:, : x.shape[1]]
+        # A power of A may overflow although no state does, so the steps are then made one by one.
     for step in range(steps):
         u = applied(step, e) if sample else u0
         if step % every == 0:
@@ -468,6 +473,26 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
             e = A.dot(e) + B.dot(u - u0) + f0
     found = (np.array([*rows, e]) + x0)[: len(x), : x.shape[1]]
     return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
+
+
+def _affine_motion(A: Array, f0: Array, e: Array, steps: int, every: int) -> Array:
+    """Return e before every `every`-th of the steps e -> A e + f0, and e after the last step."""
+    size, count = len(e), -(-steps // every)
+    step = np.zeros((size + 1, size + 1))
+    step[:size, :size] = A
+    step[:size, size] = f0
+    step[size, size] = 1.0
+    # The first rows times a power of the step are the next rows, so their number doubles each time.
+    rows = np.empty((count + 1, size + 1))
+    rows[0] = np.append(e, 1.0)
+    filled, power = 1, np.linalg.matrix_power(step, every)
+    while filled < count:
+        added = min(filled, count - filled)
+        rows[filled : filled + added] = rows[:added] @ power.T
+        filled, power = filled + added, power @ power
+    left = steps - every * (count - 1)
+    rows[count] = np.linalg.matrix_power(step, left) @ rows[count - 1]
+    return rows[:, :size]
 
 
 def _runge_kutta(rate: Callable[[Array], Array], e: Array, h: float) -> Array:

@@ -382,16 +382,18 @@ def mode_page(
     Drawing(page, robot, "rest", "ghost").place(at_rest)
     swings = [_swing(state, page, mode, lin) for mode in found.vibrations]
     points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
+    shapes = np.array([mode.shape for mode in found.vibrations])
+    energies = energies_of(robot, lin, shapes)
     modes = [
         {
             "frequency": mode.frequency,
             "damping": mode.damping_ratio,
             "unstable": bool(mode.unstable),
-            "energy": list(energies_of(robot, lin, mode.shape)[0].items())[:2],
+            "energy": list(energy.items())[:2],
             "shape": _shape(mode, lin),
             "poses": packed(poses),
         }
-        for mode, poses in zip(found.vibrations, swings, strict=True)
+        for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
     ]
     about = f"{subtitle(robot)}, {counted(len(modes), 'vibration')}"
     corners = np.concatenate(points)

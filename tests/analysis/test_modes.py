@@ -437,8 +437,9 @@ def test_energy_does_not_depend_on_the_frame_of_the_base_or_the_scale():
         for mode, same in zip(given.modes, other.modes, strict=True):
             assert same.energy == pytest.approx(mode.energy, abs=1e-9)
     lin = given.lin
-    for mode in given.modes:
-        same, _ = energies_of(lin._robot, lin, (2.0 - 3.0j) * mode.shape)
+    shapes = np.array([(2.0 - 3.0j) * mode.shape for mode in given.modes])
+    energies = energies_of(lin._robot, lin, shapes)
+    for mode, (same, _) in zip(given.modes, energies, strict=True):
         assert same == pytest.approx(mode.energy, abs=1e-14)
 
 
@@ -513,3 +514,26 @@ def test_terms_of_a_combination_that_are_left_out_are_counted():
     weights = np.array([1.0, -0.5, 0.25, 0.2, 0.0, 1e-9, 0.1])
     shown = combination(weights, tuple("abcdefg"), np.ones(7))
     assert shown == "a - 0.5 b + 0.25 c + 2 more"
+
+
+@pytest.mark.parametrize("slosh", [False, True])
+def test_modes_build_as_many_data_for_many_modes_as_for_one(monkeypatch, slosh):
+    """A pin.Data of n joints costs n^3, so one for each mode costs n^4."""
+    built = []
+    create = fflin.Robot.create_data
+    monkeypatch.setattr(fflin.Robot, "create_data", lambda self: built.append(1) or create(self))
+
+    def count(modes):
+        tanks = [
+            fflin.Slosh("base", 1.0, (0.0, 0.0, 0.1), frequency=0.2 + 0.01 * i, name=f"tank_{i}")
+            for i in range(modes if slosh else 0)
+        ]
+        springs = {f"joint_{i + 1}": 20.0 for i in range(0 if slosh else modes)}
+        robot = fflin.load("canadarm2", appendages=tanks, stiffness=springs)
+        lin = fflin.linearize(robot)
+        built.clear()
+        found = fflin.modes(lin)
+        assert len(found.vibrations) == modes * (2 if slosh else 1)
+        return len(built)
+
+    assert count(1) == count(6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.simulation.simulate import _affine_motion
 from tests.support.measured import FELT, POSITIONS, designed, foreseen
 from tests.support.motions import displaced, regulated
 from tests.support.weights import unit_weights
@@ -106,3 +107,29 @@ def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is
         run = fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.01, linear=linear)
         moved = np.abs(run.x - x0).max()
         assert np.abs(run.linear - run.x).max() < 1e-3 * moved
+
+
+@pytest.mark.parametrize("steps, every", [(1, 1), (64, 1), (100, 7), (98, 7), (5, 9)])
+def test_the_motion_of_a_linear_loop_is_that_of_its_single_steps(steps, every):
+    rng = np.random.default_rng(4)
+    A = 0.99 * np.linalg.qr(rng.normal(size=(5, 5)))[0]
+    f0, e = rng.normal(size=(2, 5))
+    expected = [e]
+    for _ in range(steps):
+        expected.append(A @ expected[-1] + f0)
+    rows = [*expected[:-1:every], expected[-1]]
+    found = _affine_motion(A, f0, e, steps, every)
+    # Each of 100 steps adds a rounding error of a few EPS, and none grows.
+    assert np.abs(found - rows).max() < 1e-12 * np.abs(rows).max()
+
+
+def test_a_prediction_survives_powers_that_overflow():
+    """A motion at rest in an unstable equilibrium is predicted, whose powers exceed all numbers."""
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    K = np.zeros(lin.B.T.shape)
+    K[:, :9] = -300.0 * np.linalg.inv(lin.B[9:])
+    policy = fflin.StateFeedback(lin, K)
+    motion = fflin.simulate(robot, policy, duration=100.0, dt=0.05, every=800)
+    assert motion.prediction.shape == motion.x.shape
+    assert not motion.prediction.any()
