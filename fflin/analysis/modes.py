@@ -51,8 +51,8 @@ class Mode(FrozenArrays):
         mapping is empty if the robot has no springs or the model was loaded from a file.
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
-        nonnegative and sum to 1. A body is named after the joint that carries it; the root body is
-        "base". A body includes its flexible appendages and sloshing liquid. The mapping is empty if
+        nonnegative and sum to 1. A body has the name of its link (of several links, the first), or
+        of its joint if it has no link; the root body is "base". A body includes its flexible appendages and sloshing liquid. The mapping is empty if
         the model was loaded from a file.
 
     Notes
@@ -80,7 +80,7 @@ class Mode(FrozenArrays):
     >>> mode.unstable, mode.shape.shape
     (False, (30,))
     >>> list(mode.energy)[:2]
-    ['panel_right', 'panel_left']
+    ['panel_right_link', 'panel_left_link']
     """
 
     pole: complex
@@ -412,7 +412,7 @@ def energies_of(
     np.add.at(sizes, owners, np.abs(terms))
     kinetic[np.abs(kinetic) <= _ROUNDING * sizes] = 0.0
     elastic = robot.springs.stiffness[:, None] * np.abs(moved[6:]) ** 2
-    names = ("base", *list(robot.model.names)[ROOT + 1 :])
+    names = _body_names(robot)
     bodies = {i for i in range(len(names)) if i + ROOT not in carriers}
     found: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
     for of_bodies, of_springs in zip(kinetic.T, elastic.T, strict=True):
@@ -424,6 +424,21 @@ def energies_of(
         strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
         found.append((energy, strain))
     return found
+
+
+def _body_names(robot: Robot) -> list[str]:
+    """Return the names of all bodies: "base", then the link that each joint carries.
+
+    A joint without a link, for example a wheel, gives its own name.
+    """
+    links = dict[int, str]()
+    for frame in robot.model.frames:
+        if frame.type == pin.FrameType.BODY:
+            links.setdefault(frame.parentJoint, frame.name)
+    root_link = links.pop(ROOT, "base")
+    joints = enumerate(list(robot.model.names)[ROOT + 1 :], ROOT + 1)
+    names = [links.get(index, name) for index, name in joints]
+    return [root_link if "base" in names else "base", *names]
 
 
 def _energies(robot: Robot, q: Array, v: Array) -> Array:
