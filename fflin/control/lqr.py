@@ -17,7 +17,14 @@ from fflin.base.errors import (
 from fflin.base.validation import Array, ArrayLike, dimension, instance
 from fflin.control.default_weights import Pace
 from fflin.control.gain import Gain, cautions, make_gain
-from fflin.control.optimal.riccati import Riccati, Solution, half_size, solve, solved
+from fflin.control.optimal.riccati import (
+    Riccati,
+    Solution,
+    best_solution,
+    is_reliable,
+    solved,
+    structured,
+)
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
 from fflin.dynamics.state import selection
 from fflin.linear.model import LinearModel
@@ -332,16 +339,17 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array) -> Solution:
-    structured = half_size(lin.A, lin.B, Q, R, N, lin.dt)
-    if structured is not None:
-        return structured
+    equation = Riccati(lin.A, lin.B, Q, R, N, lin.dt)
+    start = structured(equation)
+    if start is not None and is_reliable(start, lin.dt):
+        return start
     # If a mode makes the problem unsolvable, these checks raise an error that names the mode. The
     # general solver would fail without naming it.
     require_stabilizable(lin)
     toward = np.linalg.solve(R, N.T)
     require_weighed(lin, _difference(lin.A, lin.B, toward), _difference(Q, N, toward))
     try:
-        solution = solve(lin.A, lin.B, Q, R, N, lin.dt)
+        solution = best_solution(equation, start)
         if solution.residual > _USELESS:
             raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:

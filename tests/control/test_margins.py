@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import fflin
-from fflin.control.gain import ACCURACY
+from fflin.control.gain import ACCURACY, _largest_among, largest_gain
 from fflin.control.plots import input_loops
 from tests.support.weights import unit_weights
 
@@ -190,3 +190,53 @@ def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case)
         # The limits of gain and phase are on the edge of the disk.
         for factor in (low, high, np.exp(1j * math.radians(phase))):
             assert abs(2.0 * (factor - 1.0) / (factor + 1.0)) == pytest.approx(disk, rel=1e-12)
+
+
+def test_margins_are_computed_for_the_warning_only_if_the_weights_do_not_guarantee_them():
+    """Kalman's inequality needs a diagonal R, no cross weights, and continuous inputs."""
+    lin = fflin.linearize(fflin.load("cubesat"))
+    nx, nu = lin.B.shape
+    full = np.eye(nu) + 0.1
+    cross = np.zeros((nx, nu))
+    cross[0, 0] = 0.1
+    guaranteed = fflin.lqr(lin, np.eye(nx), np.eye(nu))
+    others = [
+        fflin.lqr(lin, np.eye(nx), full),
+        fflin.lqr(lin, np.eye(nx), np.eye(nu), cross),
+        fflin.lqr(lin.discretize(0.1), np.eye(nx), np.eye(nu)),
+    ]
+    assert "margins" not in vars(guaranteed)
+    assert all("margins" in vars(gain) for gain in others)
+    assert guaranteed.margins.disk >= 2.0 / 3.0 - 1e-9
+
+
+def test_the_largest_gain_of_many_poles_is_found_from_few_of_them():
+    """60 resonances in parallel, one of them a little larger than the others."""
+    frequencies = np.geomspace(0.1, 100.0, 60)
+    damping = np.full(60, 0.01)
+    damping[37] = 0.008
+    A, B, C = np.zeros((120, 120)), np.zeros((120, 60)), np.zeros((60, 120))
+    for i, (omega, zeta) in enumerate(zip(frequencies, damping, strict=True)):
+        A[2 * i, 2 * i + 1] = 1.0
+        A[2 * i + 1, 2 * i : 2 * i + 2] = -(omega**2), -2.0 * zeta * omega
+        B[2 * i + 1, i] = omega**2
+        C[i, 2 * i] = 1.0
+    largest, frequency = largest_gain(A, B, C, np.zeros((60, 60)))
+    # The gain of a resonance is 1 / (2 zeta sqrt(1 - zeta^2)).
+    assert largest == pytest.approx(1.0 / (0.016 * math.sqrt(1.0 - 0.008**2)), rel=ACCURACY)
+    assert frequency == pytest.approx(frequencies[37], rel=1e-3)
+
+
+@pytest.mark.parametrize("count, tried", [(60, 60), (200, 22), (2000, 28)])
+def test_a_smooth_gain_is_tried_at_few_of_many_frequencies(count, tried):
+    """A start that needs one evaluation a pole costs n^4."""
+    frequencies = np.geomspace(0.01, 100.0, count).tolist()
+    calls = []
+
+    def gain(frequency):
+        calls.append(frequency)
+        return 1.0 / (1.0 + math.log(frequency / 3.0) ** 2), frequency
+
+    largest, _ = _largest_among(gain, frequencies)
+    assert len(calls) == len(set(calls)) <= tried
+    assert largest == max(map(gain, frequencies))[0]

@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg as sl
 
 import fflin
+from fflin.control.optimal import riccati
 from fflin.control.optimal.riccati import (
     ModalMatrix,
     Riccati,
@@ -15,6 +16,7 @@ from fflin.control.optimal.riccati import (
     half_size,
     second_order_loop,
     solve,
+    structured,
 )
 from tests.support.robots import BUNDLED, random_point, random_tree
 
@@ -293,3 +295,77 @@ def test_critical_damping_is_solved_by_half_the_size():
     assert found.K == pytest.approx(np.kron([[1.0, 2.0]], np.eye(3)), abs=1e-13)
     assert found.residual < 1e-15
     assert found.poles == pytest.approx(-np.ones(6), abs=1e-7)  # the root of the rounding
+
+
+def of_inertias(spread, m=20):
+    """Double integrators with an inertia matrix of the given condition number."""
+    axes = np.linalg.qr(np.random.default_rng(1).normal(size=(m, m)))[0]
+    inertia = axes * np.logspace(0.0, np.log10(spread), m) @ axes.T
+    A, B = np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m))
+    A[:m, m:], B[m:] = np.eye(m), np.linalg.inv(inertia)
+    return A, B, np.eye(2 * m), np.eye(m)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize("spread", [1e2, 1e4, 1e6])
+def test_the_rounding_of_a_residual_is_predicted(spread, dt):
+    A, B, Q, R = of_inertias(spread)
+    if dt:
+        A, B = np.eye(len(A)) + dt * A, dt * B + 0.5 * dt**2 * A @ B
+    equation = Riccati(A, B, Q, R, None, dt)
+    trial = equation.trial(solve(A, B, Q, R, None, dt).P)
+    # The same residual matrix with 64 bits instead of 53 bits
+    if np.finfo(np.longdouble).eps > 1e-18:
+        pytest.skip("long double has no more bits than double")
+    P, E = trial.P.astype(np.longdouble), equation.rate.astype(np.longdouble)
+    change = P @ E
+    Y = B.T.astype(np.longdouble) @ P
+    spent = Y.T @ Y
+    defect = change + change.T - spent + Q
+    if dt:
+        K = equation.gain(trial.P).astype(np.longdouble)
+        W = R + B.T.astype(np.longdouble) @ P @ B
+        Z = Y @ A
+        # W is rounded in K, but the residual of W K = Z enters as its square only.
+        spent = Z.T @ K + K.T @ Z - K.T @ W @ K
+        defect = change + change.T + E.T @ change - spent + Q
+    size = np.linalg.norm(trial.defect) / trial.residual
+    apart = float(np.sqrt(((trial.defect - defect) ** 2).sum())) / size
+    # Independent errors are at most half an EPS, and some cancel, so the prediction is larger.
+    assert 0.05 * trial.rounding < apart < trial.rounding
+
+
+def test_an_ill_conditioned_inertia_is_solved_by_half_the_size(monkeypatch):
+    """Its residual is rounding alone, so no other method and no other modes are tried."""
+    A, B, Q, R = of_inertias(1e7)
+    calls = []
+    monkeypatch.setattr(riccati, "_general", lambda *_: calls.append("general"))
+    modes = ModalMatrix.of
+    monkeypatch.setattr(ModalMatrix, "of", lambda *given: calls.append("modes") or modes(*given))
+    found = solve(A, B, Q, R)
+    assert calls.count("modes") <= 1
+    assert "general" not in calls
+    assert 1e-11 < found.residual < found.rounding
+    # Each eigenvalue s of the inertia is a double integrator with B = 1/s and unit weights, whose
+    # closed-loop polynomial is z^2 + z sqrt(1/s^2 + 2/s) + 1/s.
+    s = np.logspace(0.0, 7.0, 20)
+    damping = np.sqrt(1.0 / s**2 + 2.0 / s)
+    roots = np.array([np.roots([1.0, d, 1.0 / each]) for d, each in zip(damping, s, strict=True)])
+    slowest = -np.abs(roots.real).min()
+    assert found.poles.real.max() == pytest.approx(slowest, rel=1e-6)
+
+
+def test_an_inaccurate_start_is_not_computed_again(monkeypatch):
+    """The regulator tries the half-size method once, and then SciPy's."""
+    lin = fflin.linearize(fflin.load("cubesat"))
+    starts = []
+
+    def poor(equation, apart=0.0):
+        starts.append(apart)
+        found = structured(equation, apart)
+        return found._replace(residual=1e-3)
+
+    monkeypatch.setattr("fflin.control.lqr.structured", poor)
+    gain = fflin.lqr(lin, np.eye(12), np.eye(6))
+    assert starts == [0.0]
+    assert gain.method == "general"

@@ -14,12 +14,15 @@ from fflin.base.validation import Array, Values
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A solution with at most this relative residual is accepted, and no other method is tried.
+# A solution with at most this relative residual is accepted, and no other method is tried. If
+# rounding alone causes a larger residual (see `_Trial`), this larger residual is accepted, because
+# no method can reduce it.
 _SOUND = 1e-11
 _STEPS = 25
 
-# A residual below _ROUNDED is rounding error if a Newton step does not halve it. If the residual is
-# below _NEAR, a Newton step is accepted only if it reduces the residual.
+# A residual below _ROUNDED, or below the rounding error of `_Trial`, cannot be reduced if a Newton
+# step does not halve it. If the residual is below _NEAR, a Newton step is accepted only if it
+# reduces the residual.
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
@@ -35,7 +38,7 @@ class Solution(NamedTuple):
     """Solution P of a Riccati equation, with its gain K, residual and method.
 
     `poles` are the sorted poles of A - B K. `margin` is the distance of the nearest pole from the
-    stability boundary.
+    stability boundary. `rounding` is the part of the residual that rounding may cause.
     """
 
     P: Array
@@ -44,15 +47,28 @@ class Solution(NamedTuple):
     residual: float
     method: str
     margin: float
+    rounding: float = 0.0
+
+    @property
+    def sound(self) -> bool:
+        """Whether no other method can find a much more accurate solution."""
+        return self.residual <= max(_SOUND, self.rounding)
 
 
 def solved(
-    P: Array, K: Array, poles: Values, residual: float, method: str, *, discrete: bool = False
+    P: Array,
+    K: Array,
+    poles: Values,
+    residual: float,
+    method: str,
+    *,
+    rounding: float = 0.0,
+    discrete: bool = False,
 ) -> Solution:
     """Return a `Solution` with sorted poles and with the margin of the poles."""
     poles = poles[np.lexsort((poles.imag, poles.real))]
     margin = float(1.0 - np.abs(poles).max() if discrete else -poles.real.max())
-    return Solution(P, K, poles, residual, method, margin)
+    return Solution(P, K, poles, residual, method, margin, rounding)
 
 
 def rates_of(poles: Values, dt: float) -> Values:
@@ -61,9 +77,17 @@ def rates_of(poles: Values, dt: float) -> Values:
 
 
 class _Trial(NamedTuple):
+    """Approximate solution P, with its residual matrix and the relative norm of this matrix.
+
+    `rounding` is the relative norm that the rounding errors of the residual matrix have if the
+    errors of single products are independent of each other. It exceeds machine epsilon if a product
+    cancels. For example, B and P of a long chain are an inverse inertia and almost an inertia.
+    """
+
     P: Array
     defect: Array
     residual: float
+    rounding: float
 
 
 class Riccati:
@@ -81,6 +105,7 @@ class Riccati:
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
+        self._inputs = B.T
         if not dt:
             self._inputs = dtrtrs(self.R_factor, B.T, lower=1)[0]
             self.cross = None if N is None else dtrtrs(self.R_factor, N.T, lower=1)[0]
@@ -92,8 +117,8 @@ class Riccati:
         return K
 
     def trial(self, P: Array) -> _Trial:
-        """Return P, its residual matrix (`defect`), and the relative norm of this matrix."""
-        _, Y = self._factored(P)
+        """Return P with its residual matrix and the norms of `_Trial`."""
+        factor, Y = self._factored(P)
         change = P @ self.rate
         spent = Y.T @ Y
         defect = change + change.T - spent + self.Q
@@ -105,7 +130,23 @@ class Riccati:
         residual = _norm(defect) / max(size, _TINY)
         if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model overflow")
-        return _Trial(P, defect, residual)
+        return _Trial(P, defect, residual, self._rounding(P, factor, Y) / max(size, _TINY))
+
+    def _rounding(self, P: Array, factor: Array, Y: Array) -> float:
+        """Return the norm of the rounding errors of the residual matrix; see `_Trial`."""
+        # If each product in X Z has an independent error of EPS times itself, the squared errors of
+        # an entry sum to EPS^2 (X^2 Z^2), with squares entry by entry. The norm needs only the sums
+        # of rows.
+        squares = P**2
+        right = squares.sum(axis=1)
+        inputs = self._inputs
+        if self.discrete:
+            right = squares @ (self.A**2).sum(axis=1)
+            inputs = dtrtrs(factor, self.B.T, lower=1)[0]
+        of_Y = inputs**2 @ right
+        spent = (Y**2).sum(axis=1) @ of_Y
+        change = squares.sum(axis=0) @ (self.rate**2).sum(axis=1)
+        return 2.0 * _EPS * math.sqrt(spent + change)
 
     def _factored(self, P: Array) -> tuple[Array, Array]:
         """Return the Cholesky factor L of W, and Y = L' K with the gain K.
@@ -129,13 +170,35 @@ def solve(
 ) -> Solution:
     """Return the stabilising solution of an algebraic Riccati equation.
 
-    SciPy is used only if the half-size method fails or is inaccurate. The solution with the
-    smallest residual is returned. If both methods fail, raise `LinAlgError`. Newton's method
-    refines the solution (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
+    SciPy is used only if the half-size method fails or is inaccurate; see `best_solution`.
     """
     equation = Riccati(A, B, Q, R, N, dt)
-    start = _half_size(equation)
-    if start is not None and start.residual <= _SOUND:
+    return best_solution(equation, structured(equation))
+
+
+def half_size(
+    A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
+) -> Solution | None:
+    """Return the solution of the half-size method, or None if it is not reliable."""
+    found = structured(Riccati(A, B, Q, R, N, dt))
+    return found if is_reliable(found, dt) else None
+
+
+def is_reliable(found: Solution | None, dt: float) -> bool:
+    """Return whether a solution is accurate and has no pole near the stability boundary."""
+    if found is None or not found.sound:
+        return False
+    size = np.abs(found.poles - 1.0 if dt else found.poles).max()
+    return bool(found.margin >= _NEAR_BOUNDARY * size)
+
+
+def best_solution(equation: Riccati, start: Solution | None) -> Solution:
+    """Return the most accurate of `start`, the result of `structured`, and SciPy's solutions.
+
+    SciPy is not used if `start` is accurate. If there is no solution, raise `LinAlgError`. Newton's
+    method refines the solutions (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
+    """
+    if start is not None and start.sound:
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
@@ -145,28 +208,14 @@ def solve(
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
                 found.append(general)
-                if general.residual <= _SOUND:
+                if general.sound:
                     break
     if not found:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
     return min(found, key=lambda solution: solution.residual)
 
 
-def half_size(
-    A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
-) -> Solution | None:
-    """Return the solution of the half-size method, or None if it is not reliable.
-
-    The solution is not reliable if it is inaccurate, or if a pole is near the stability boundary.
-    """
-    found = _half_size(Riccati(A, B, Q, R, N, dt))
-    if found is None or found.residual > _SOUND:
-        return None
-    size = np.abs(found.poles - 1.0 if dt else found.poles).max()
-    return found if found.margin >= _NEAR_BOUNDARY * size else None
-
-
-def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
+def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
     """Solve by the half-size method, or return None if the method fails.
 
     Newton's method starts from the loop of a modified Q: the rows and columns of the velocities are
@@ -192,11 +241,11 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
         P = modes.lyapunov_modal(cost)
         refined = _refined(equation, P, None if equation.discrete else modes)
         found = _finished(equation, *refined, "structured")
-    if apart or (found is not None and found.residual <= _SOUND):
+    if apart or (found is not None and found.sound):
         return found
     # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
     # method then starts from the loop of a slightly different Q.
-    return _half_size(equation, _APART) or found
+    return structured(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
@@ -225,7 +274,15 @@ def _finished(
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
     poles = modes.poles(F) if modes else np.linalg.eigvals(F)
-    found = solved(trial.P, K, poles, trial.residual, method, discrete=equation.discrete)
+    found = solved(
+        trial.P,
+        K,
+        poles,
+        trial.residual,
+        method,
+        rounding=trial.rounding,
+        discrete=equation.discrete,
+    )
     return found if found.margin > 0.0 else None
 
 
@@ -250,7 +307,7 @@ def _refined(
             trial = better
         if trial.residual < best.residual:
             best = trial
-        if trial.residual < _ROUNDED:
+        if trial.residual < max(_ROUNDED, trial.rounding):
             if gain < 2.0:
                 break
         elif gain < 10.0:
