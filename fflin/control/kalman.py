@@ -17,7 +17,8 @@ from fflin.control.gain import Gain, ModelDesign
 from fflin.control.lqr import require_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
-from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time, steady_end
+from fflin.control.trajectory_end import steady_end
+from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.dynamics.state import selection
@@ -356,7 +357,7 @@ def tvkalman(
     P0 : "steady", or as W
         Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
         start point is the first configuration, in its initial motion if this motion is steady,
-        otherwise at rest.
+        otherwise at rest, or in free fall as in `tvlqr`.
     sample : float
         Sampling time [s], which must divide the duration.
 
@@ -400,7 +401,8 @@ def tvkalman(
         return 0.5 * (spread + spread.T)
 
     if asks_steady(P0, "P0", "a covariance"):
-        lin, early = steady_end(traj, 0), intensity(float(traj.t[0]))
+        start, early = steady_end(traj, 0), intensity(float(traj.t[0]))
+        lin = start.of_trajectory(traj.robot)
         with located("give P0, because no steady filter exists at the start of the trajectory"):
             P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
     else:

@@ -328,6 +328,8 @@ def require_fixed_point(lin: LinearModel) -> None:
     )
     if lin.moving:
         advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
+        if lin._robot is not None and any(lin._robot.gravity):
+            advice += "; in free fall, the errors move as without gravity: set gravity to zero"
     raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")
 
 

@@ -19,7 +19,8 @@ from fflin.control.lqr import regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
-from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
+from fflin.control.trajectory_end import rest_or_fall, steady_regulator
+from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
 from fflin.control.weights import Rule, Weight, sampled_cost, weight
 from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along
@@ -280,19 +281,29 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
-    models, end, stages = along(traj.resampled(dt)), follows.end, list[Stage]()
-    held, sampled = sampled_cost(end, dt, schedule.Q, schedule.R), end.discretize(dt)
-    P, K = steady_regulator(end, schedule.Q, schedule.R, dt)
+    models, stages = along(traj.resampled(dt)), list[Stage]()
+    rest = rest_or_fall(traj)
+    end = rest.of_trajectory(traj.robot)
+    held = sampled_cost(end, dt, rest.map.T @ schedule.Q @ rest.map, schedule.R)
+    sampled = end.discretize(dt)
+    P, K = steady_regulator(rest, schedule.Q, schedule.R, dt)
     total = np.block([[held.Q, held.N], [held.N.T, held.R]])
-    last = total, np.hstack((sampled.A, sampled.B)), K, P, end, end.u0
+    last = total, np.hstack((sampled.A, sampled.B)), K, P, end, end.u0, rest.v
     designs = [
-        (*sample, schedule.K[k], schedule.P[k + 1], models[k + 1], follows.commanded(k * dt)[2])
+        (
+            *sample,
+            schedule.K[k],
+            schedule.P[k + 1],
+            models[k + 1],
+            follows.commanded(k * dt)[2],
+            models.v[k + 1],
+        )
         for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
     ]
-    for total, step, K, P, of, u in (*designs, last):
+    for total, step, K, P, of, u, v in (*designs, last):
         # The base pose in x is zero, because limits of the base pose apply to the error relative to
         # the trajectory.
-        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
+        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(v)))
         stages.append(ahead.stage(total, step, K, P, of, u, x))
     stages += stages[-1:] * (ahead.samples - 1)
     return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))

@@ -14,7 +14,8 @@ from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.kalman import kalman
 from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider
-from fflin.control.tvlqr import FilterSchedule, GainSchedule, resting_end, steady_regulator
+from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
+from fflin.control.tvlqr import FilterSchedule, GainSchedule
 from fflin.dynamics.coordinates import Frame, moved_by, moving_error
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -121,7 +122,7 @@ class TrajectoryFeedback(Feedback):
     def end_gain(self) -> Array:
         """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
         by = self.schedule
-        return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
+        return steady_regulator(SteadyEnd(self.end, np.zeros(3)), by.Q, by.R, by.dt)[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
         """Return q (nq,) and v (nv,) displaced from the initial state of the trajectory.

@@ -11,23 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import block_diag
 
-from fflin.analysis.reduction import momentum_reduction
-from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
+from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
-from fflin.control.gain import Gain, ModelDesign
-from fflin.control.lqr import regulator
+from fflin.control.gain import ModelDesign
 from fflin.control.optimal import differential_riccati as riccati
-from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, sampled_cost, weight
+from fflin.control.trajectory_end import steady_end, steady_regulator
+from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import StateMap
-from fflin.linear.equilibrium import equilibrium
 from fflin.linear.fit import require_same
 from fflin.linear.linear_trajectory import LinearTrajectory, transitions
-from fflin.linear.linearization import Linearizer
-from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
@@ -285,8 +281,9 @@ def tvlqr(
     Qf : "steady", or as Q
         Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the end
         point. The end point is the last configuration, in its final motion if this motion is
-        steady, otherwise at rest. States that the inputs cannot stabilise have zero weight in Qf,
-        see `momentum_reduction`.
+        steady, otherwise at rest. A robot that falls freely at the end, such as a legged robot in
+        a jump, is at rest there relative to axes that fall with it (5.4). States that the inputs
+        cannot stabilise have zero weight in Qf, see `momentum_reduction`.
     sample : float, optional
         Sampling time [s], which must divide the duration.
     weights : {"urdf", "identity"} or mapping, optional
@@ -309,7 +306,8 @@ def tvlqr(
     UnknownNameError
         If a name does not exist.
     EquilibriumError, StabilizabilityError
-        If Qf is "steady" and no inputs can hold the robot at the end point.
+        If Qf is "steady", no inputs can hold the robot at the end point, and the robot does not
+        fall freely there.
 
     References
     ----------
@@ -330,7 +328,7 @@ def tvlqr(
     names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        Q, R, _, rule = rule_weights(steady_end(traj), weights, pace)
+        Q, R, _, rule = rule_weights(steady_end(traj).model, weights, pace)
     elif weights is not None or Q is None or R is None:
         raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
     Q, R, _ = cost_weights(traj, Q, R, None)
@@ -400,49 +398,3 @@ def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
     return 0.0 if sample is None else number("sample", sample)
-
-
-def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
-    """Return the model at knot `end`. If the knot is not steady, return the model at rest there."""
-    lin = traj[end]
-    if lin.is_equilibrium():
-        return lin
-    try:
-        return resting_end(traj, end)
-    except EquilibriumError as error:
-        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
-        raise EquilibriumError(
-            f"no inputs hold the robot at the {where} of the trajectory: {error}; give {given}"
-        ) from None
-
-
-def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest at knot `end`, in base axes. Only wheels keep their speeds."""
-    robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
-    wheels = robot.wheels_at(traj.v[end])
-    spinning = [joint.idx_v for joint in robot.joints if joint.name in wheels]
-    v[spinning] = traj.v[end, spinning]
-    held = equilibrium(robot, q, v=v)
-    return Linearizer(robot, moving=True)(held.q, v, held.u)
-
-
-def steady_regulator(
-    lin: LinearModel, Q: Array, R: Array, sample: float | None
-) -> tuple[Array, Array]:
-    """Return the cost matrix P (nx, nx) and the gain K (nu, nx) about a steady point.
-
-    If the inputs cannot stabilise the model, its `momentum_reduction` is regulated.
-    """
-
-    def about(lin: LinearModel, Q: Array) -> Gain:
-        if not sample:
-            return regulator(lin, Q, R)
-        return regulator(lin.discretize(sample), *sampled_cost(lin, sample, Q, R))
-
-    try:
-        gain = about(lin, Q)
-        return gain.P, gain.K
-    except StabilizabilityError:
-        part = momentum_reduction(lin)
-        gain = about(part, part.T.T @ Q @ part.T)
-        return part.S.T @ gain.P @ part.S, gain.K @ part.S

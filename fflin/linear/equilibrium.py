@@ -194,10 +194,12 @@ def equilibrium(
             for i in np.argsort(-sizes)  # the largest scaled force first
             if sizes[i] > 1e-6 * sizes.max()
         ]
+        advice = "add inputs that balance these forces (thrusters cannot pull)"
+        if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
+            advice += ", set gravity to zero if the robot falls freely"
         raise EquilibriumError(
             f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-            f"forces: {listed(forces)}; add inputs that balance these forces (thrusters cannot "
-            "pull), or choose another point"
+            f"forces: {listed(forces)}; {advice}, or choose another point"
         )
     at, u = balance.lin.q, balance.u
     if reference is not None or robot.orbit:

@@ -130,7 +130,7 @@ class JointTorque(Input):
 
 @dataclass(frozen=True)
 class Thruster(Input):
-    """Force [N] of a thruster, with its point of action and direction fixed in a frame.
+    """Force [N] of a thruster or rotor, with its point of action and direction fixed in a frame.
 
     Parameters
     ----------
@@ -155,6 +155,10 @@ class Thruster(Input):
         Smallest impulse [N s] that the thruster can produce in a sample. If the commanded impulse
         is smaller, the thruster does not fire, and this impulse is added to the command of the next
         sample.
+    torque : float
+        Reaction torque [N m] on the link for each newton of force, about the direction of the
+        force; zero by default. For a propeller this is the drag torque, which is opposite to the
+        rotation: it is negative for a propeller that turns by the right-hand rule about the force.
 
     Examples
     --------
@@ -162,6 +166,9 @@ class Thruster(Input):
     >>> robot = fflin.load("servicer_7dof", inputs=[nozzle])
     >>> fflin.linearize(robot).input_names
     ('thruster_1',)
+    >>> rotor = fflin.Thruster("base", (0.2, 0, 0), (0, 0, 1), "front", max=6.0, torque=-0.016)
+    >>> rotor.wrench.tolist()
+    [0.0, 0.0, 1.0, 0.0, -0.2, -0.016]
     """
 
     KEY, GROUP, UNIT, PULLS = "thruster", "thrust", "N", False
@@ -171,6 +178,7 @@ class Thruster(Input):
     name: str | None = None
     on_off: bool = field(default=False, kw_only=True, repr=False)
     least_impulse: float | None = field(default=None, kw_only=True, repr=False)
+    torque: float = field(default=0.0, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,11 +192,13 @@ class Thruster(Input):
             self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
         self._set("position", three_numbers("thruster position", self.position))
         self._set("direction", unit_vector("thruster direction", self.direction))
+        self._set("torque", number("thruster torque", self.torque))
 
     @property
     def wrench(self) -> Array:
         """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
-        return np.concatenate((self.direction, np.cross(self.position, self.direction)))
+        force = np.array(self.direction)
+        return np.concatenate((force, np.cross(self.position, force) + self.torque * force))
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,8 @@ class Parameters(dict[str, Parameter]):
             if isinstance(item, Thruster) and own:
                 old = zip(AXES, item.position, strict=True)
                 position = [own.get(f"position.{axis}", x) for axis, x in old]
-                inputs[index] = replace(item, position=position)
+                torque = own.get("torque", item.torque)
+                inputs[index] = replace(item, position=position, torque=torque)
         fields = {**springs, "inputs": tuple(inputs)}
         changed = {key: value for key, value in fields.items() if value != getattr(robot, key)}
         return robot.replace(**changed) if changed else robot
@@ -240,12 +241,17 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 # component of d that is perpendicular to the direction has an effect.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
-                tilted = np.concatenate((turned, np.cross(where, turned)))
+                tilted = np.concatenate((turned, np.cross(where, turned) + item.torque * turned))
                 changes = ("position", "m", where, moved), ("direction", "1", along, tilted)
                 for part, unit, at_joint, wrench in changes:
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
                     made = Parameter(names[0], f"{part}.{letter}", unit, float(at_joint @ d))
                     yield replace(made, wrench=(joint, first, in_joint))
+            if item.torque:
+                reaction = np.concatenate((np.zeros(3), along))
+                in_joint = np.array(placement.act(pin.Force(reaction)).vector)
+                made = Parameter(names[0], "torque", "m", item.torque)
+                yield replace(made, wrench=(joint, first, in_joint))
         if isinstance(item, ReactionWheel) and item.inertia:
             joint, axis = carrier(robot.model, item)
             own = robot.model.getJointId(names[0])

@@ -79,9 +79,9 @@ class Sensitivity:
     if the frequency is changed.
 
     Other parameters are ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
-    ``THRUSTER.direction.x`` and ``WHEEL.inertia``. A change of the length of ``THRUSTER.direction``
-    has no effect. The inertia of a wheel's carrier includes the wheel, so a larger wheel inertia
-    reduces the inertia of the rest of the carrier.
+    ``THRUSTER.direction.x``, ``THRUSTER.torque`` [m] if it is nonzero, and ``WHEEL.inertia``. A
+    change of the length of ``THRUSTER.direction`` has no effect. The inertia of a wheel's carrier
+    includes the wheel, so a larger wheel inertia reduces the inertia of the rest of the carrier.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ def test_lanes_fly_every_policy(robots, name, make):
 def equipped():
     """A robot with inputs of all kinds, two of its wheels not on the base."""
     motors = [fflin.JointTorque(f"joint_{k}") for k in range(1, 8)]
-    jet = fflin.Thruster("link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0)
+    jet = fflin.Thruster("link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0, torque=0.4)
     storing = fflin.ReactionWheel((1, 2, 2), "link_2", name="storing", momentum=3.0)
     spin = fflin.ReactionWheel((1, -2, 1), "link_3", name="spin", inertia=1e-3)
     inputs = [fflin.BaseForce(), *motors, jet, storing, fflin.BaseTorque(), spin]

@@ -12,7 +12,7 @@ from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 THRUSTERS = (
     fflin.Thruster("base", (0.4, 0.1, -0.2), (1.0, 0.2, 0.0)),
-    fflin.Thruster("link_3", (0.1, 0.0, 0.2), (0.0, -3.0, 0.0), name="on_the_arm"),
+    fflin.Thruster("link_3", (0.1, 0.0, 0.2), (0.0, -3.0, 0.0), name="on_the_arm", torque=0.5),
     fflin.Thruster("tool", (0.0, 0.05, 0.0), (0.3, 0.1, -1.0)),
 )
 
@@ -92,7 +92,7 @@ def test_check_holds_where_joints_mimic_others():
 
 @pytest.mark.parametrize("thruster", THRUSTERS)
 def test_thruster_column_is_the_work_of_its_force(thruster):
-    """Power of the force over the velocity of the point where it acts."""
+    """Power of the force over the velocity of its point, and of the reaction torque."""
     rng = np.random.default_rng(5)
     robot = fflin.load("servicer_7dof", inputs=[thruster])
     q, v, _ = random_point(fflin.load("servicer_7dof"), rng)
@@ -104,7 +104,8 @@ def test_thruster_column_is_the_work_of_its_force(thruster):
     at_point = velocity.linear + np.cross(velocity.angular, thruster.position)
     nu = fflin.StateMap(robot, frame="local").to_state(q, v)[6 + robot.n :]
     generalised = lin.M @ lin.B[6 + robot.n :, 0]
-    assert generalised @ nu == pytest.approx(at_point @ thruster.direction, rel=1e-11)
+    power = (at_point + thruster.torque * velocity.angular) @ thruster.direction
+    assert generalised @ nu == pytest.approx(power, rel=1e-11)
 
 
 def test_thrust_slope_by_the_closed_form():

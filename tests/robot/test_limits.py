@@ -117,6 +117,7 @@ def test_limits_make_no_second_input():
         (lambda: fflin.Thruster(*AT, on_off=True, max=2, min=1), "on_off.* min"),
         (lambda: fflin.Thruster(*AT, on_off="yes", max=2), "on_off"),
         (lambda: fflin.Thruster(*AT, least_impulse=0), "least_impulse"),
+        (lambda: fflin.Thruster(*AT, torque=math.inf), "thruster torque"),
         (lambda: fflin.ReactionWheel((1, 0, 0), max_speed=3), "max_speed"),
         (
             lambda: fflin.ReactionWheel((1, 0, 0), inertia=1, max_speed=-3),
@@ -191,6 +192,7 @@ direction = [1, 0, 0]
 max = 22
 on_off = true
 least_impulse = 0.1
+torque = -0.02
 [[input]]
 type = "reaction_wheel"
 axis = [0, 0, 1]
@@ -202,7 +204,7 @@ max_speed = 600
     assert fflin.load_inputs(path) == (
         fflin.BaseTorque(max=40.0),
         fflin.BaseForce(max=(3.0, 2.0, 1.5), min=-1.0),
-        fflin.Thruster(*AT, max=22.0, on_off=True, least_impulse=0.1),
+        fflin.Thruster(*AT, max=22.0, on_off=True, least_impulse=0.1, torque=-0.02),
         fflin.ReactionWheel((0, 0, 1), inertia=1e-3, max=0.2, max_speed=600.0),
     )
 

@@ -201,6 +201,7 @@ def sound(folder):
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
             **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
+            "torque": 0.02,
         },
         "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "hold": None, "frame": "local"},

@@ -350,11 +350,12 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     assert says(S.table(3, "joint_1.stiffness"), "none of these")
 
 
+@pytest.mark.parametrize("torque", [0.0, -0.3])
 @pytest.mark.parametrize("axis", "xyz")
-def test_every_place_and_direction_of_a_thruster(axis):
+def test_every_place_and_direction_of_a_thruster(axis, torque):
     robot, at = fflin.load("ets_vii"), "xyz".index(axis)
     where, along = np.array((0.1, 0.2, -0.1)), np.array((0.48, 0.6, 0.64))
-    jet = fflin.Thruster("link_4", where, along, name="jet")
+    jet = fflin.Thruster("link_4", where, along, name="jet", torque=torque)
     q = random_point(robot, np.random.default_rng(3), degrees=60.0)[0]
 
     def B(**fields):
@@ -369,6 +370,13 @@ def test_every_place_and_direction_of_a_thruster(axis):
     expected = fourth_order(lambda s: B(direction=along + s * unit), 3e-3)
     got = S[f"jet.direction.{axis}"].dB
     assert np.abs(got - expected).max() < 1e-8 * np.abs(expected).max()
+    assert ("jet.torque" in S.parameters) == bool(torque)
+    if torque:
+        expected = B(torque=0.5) - B(torque=-0.5)
+        got = S["jet.torque"].dB
+        assert np.abs(got - expected).max() < 1e-12 * np.abs(B()).max()
+        drawn = fflin.uncertain(robot.replace(inputs=[jet]), {"jet.torque": 0.5}).samples(3, seed=1)
+        assert all(0.15 < -each.inputs[0].torque < 0.45 for each in drawn)
 
 
 def test_in_orbit_masses_change_what_the_field_does():
