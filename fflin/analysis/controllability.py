@@ -10,7 +10,7 @@ import numpy as np
 from fflin.analysis import along_motion, mechanics, moving_points, ranks
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.mechanics import ConservedMomenta, combination
-from fflin.analysis.observability import observability
+from fflin.analysis.observability import lasting_motions, observability
 from fflin.base.errors import (
     DetectabilityError,
     FflinError,
@@ -440,17 +440,46 @@ def require_stabilizable(lin: LinearModel) -> None:
         return _conclude(StabilizabilityError, *said)
     found, words = controllability(lin), ""
     if not found.stabilizable:
-        # The message names the momenta and the other uncontrollable states. It omits the
-        # coordinates whose rates are the momenta.
-        count = len(mechanics.conserved(lin).weights)
-        lost = (*found.uncontrollable[:count], *found.uncontrollable[2 * count :])
-        words = missed.format(listed(mechanics.grouped(lost)))
-        if count:
-            words += (
-                ", add a spring to any joint that no input moves (--stiffness, stiffness=), or "
-                "design on fflin.momentum_reduction(lin) (--reduce)"
-            )
+        # The message names the momenta and the other uncontrollable states that do not decay. It
+        # omits the coordinates whose rates are the momenta.
+        conserved = mechanics.conserved(lin)
+        count = len(conserved.weights)
+        others = _lasting(lin, found, 2 * count)
+        lost = (*found.uncontrollable[:count], *others)
+        words = missed.format(listed(mechanics.grouped(lost))) + _remedies(lin, conserved)
     return _conclude(StabilizabilityError, words, found.notes, found.margin)
+
+
+def _lasting(lin: LinearModel, found: Controllability, first: int) -> tuple[str, ...]:
+    """Name the uncontrollable combinations of states that do not decay by themselves.
+
+    The combinations are the rows of the result `found` from the row `first` on. The rows before it
+    are conserved.
+    """
+    rows, names = found.rows, found.uncontrollable[first:]
+    if found.method == "modes" or not names:
+        return names  # undamped vibrations and instabilities
+    # The combinations z = rows x obey dz/dt = F z, because they span a left invariant subspace.
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    F = (rows @ mechanics.rate_matrix(lin) / size) @ np.linalg.pinv(rows / size)
+    left = ranks.lasting(F[first:, first:].T, lin.dt)
+    if left.shape[1] == len(names) or not (left.shape[1] or first):
+        return names
+    return tuple(_named(left.T @ rows[first:], lin.state_names, size)[1])
+
+
+def _remedies(lin: LinearModel, conserved: ConservedMomenta) -> str:
+    """Return what helps if momenta are conserved, besides more inputs.
+
+    A spring between links changes the momentum of a joint, but not the momentum of the robot.
+    """
+    of_joint = [name.startswith("qdot_m.") for name in lin.state_names[len(lin.M) :]]
+    advice = ""
+    if conserved.weights[:, of_joint].any():
+        advice += ", add a spring to any joint that no input moves (--stiffness, stiffness=)"
+    if len(conserved.weights) and len(conserved.kept):
+        advice += ", or design on fflin.momentum_reduction(lin) (--reduce)"
+    return advice
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -460,7 +489,7 @@ def require_detectable(lin: LinearModel) -> None:
         said = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
         return _conclude(DetectabilityError, *said)
     found = observability(lin)
-    words = "" if found.detectable else missed.format(listed(found.unobservable))
+    words = "" if found.detectable else missed.format(listed(lasting_motions(lin, found)))
     return _conclude(DetectabilityError, words, found.notes, found.margin)
 
 

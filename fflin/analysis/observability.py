@@ -13,6 +13,7 @@ from fflin.analysis.ranks import (
     Margin,
     RankAnalysis,
     echelon,
+    lasting,
     verdict,
 )
 from fflin.base.errors import InputError, listed
@@ -255,6 +256,20 @@ def _result(
         notes=notes,
         robot=lin.robot,
     )
+
+
+def lasting_motions(lin: LinearModel, found: Observability) -> tuple[str, ...]:
+    """Name the unobservable motions of an analysis that do not decay by themselves."""
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    basis = found.basis * size[:, None]
+    # The motions span an invariant subspace: A basis = basis F.
+    rate = size[:, None] * mechanics.rate_matrix(lin) / size
+    F = np.linalg.pinv(basis) @ rate @ basis
+    motions = lasting(F, lin.dt)
+    if motions.shape[1] in (0, len(F)):
+        return found.unobservable
+    lasts, _ = echelon(found.basis @ motions, size)
+    return tuple(mechanics.combination(column, lin.state_names, size) for column in lasts.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,10 @@ _CLEAN = 1e-10
 # tolerance is undecided.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
+# A fixed pole counts as constant, for the naming of what does not decay, if its decay rate is below
+# this fraction of the fastest rate. It exceeds the square root of the rounding error.
+_LASTING = 1e-6
+
 # Forces are entries of a matrix of springs, dampers or inputs, and are compared in units of energy.
 # The threshold of a force is its rounding error, but at least _FLOOR times the largest force in the
 # matrix. A force below the threshold may be a rounding error. A force below _ROUNDING times the
@@ -242,6 +246,28 @@ def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
     U, values, _ = np.linalg.svd(matrix)
     rank = int((values > tolerance).sum())
     return U[:, :rank], U[:, rank:]
+
+
+def lasting(F: Array, dt: float) -> Array:
+    """Return an orthonormal basis (k, m) of the motions of ``dz/dt = F z`` that do not decay.
+
+    For a sampled model, F is (A - I)/dt. A decay rate below _LASTING times the fastest rate counts
+    as zero, because rounding moves a double pole at zero by the square root of the rounding error.
+    """
+    from scipy.linalg import schur
+
+    if not F.size:
+        return np.zeros((len(F), 0))
+    least = _LASTING * float(np.abs(np.linalg.eigvals(F)).max())
+
+    def lasts(real: float, imaginary: float) -> bool:
+        rate = complex(real, imaginary)
+        decay = (1.0 - abs(1.0 + dt * rate)) / dt if dt else -real
+        return decay <= least
+
+    _, vectors, count = schur(F, sort=lasts)
+    basis: Array = vectors[:, :count]
+    return basis
 
 
 def unit_columns(matrix: Array) -> Array:

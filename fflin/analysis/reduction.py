@@ -345,18 +345,13 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
-    """Return the model of the regulated states, or `lin` itself if it has no wheels."""
+    """Return the model of the regulated states, or `lin` itself if all states are regulated."""
     # The model omits the `removed_wheels`. For every other wheel, it omits the angle if the angle
     # affects no other state, so the model may have fewer positions than rates. It also omits the
     # coordinates of the base position on which no input acts, and their rates.
-    if not (wheel_inputs(lin) or lin.wheels):
+    base = unpushed_positions(lin)
+    if not (len(base) or wheel_inputs(lin) or lin.wheels):
         return lin
-    source, nv = lin.generator or lin, len(lin.M)
-    driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
-    base = [i for i in range(nv) if not driven[i] and lin.state_names[i].startswith("r_b.")]
-    columns = [*base, *(i + nv for i in base)]
-    if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
-        base = []  # in rotating axes, each direction affects the others
     removed = np.union1d(base, removed_wheels(lin, wheel_speeds)).astype(np.intp)
     part = without(lin, removed)
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
@@ -367,6 +362,25 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
             "the wheels"
         )
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
+
+
+def unpushed_positions(lin: LinearModel) -> Indices:
+    """Return the indices (k,) of the base positions that no input pushes.
+
+    The result is empty if these positions or their rates affect any other state.
+    """
+    nv = len(lin.M)
+    positions = [i for i in range(nv) if lin.state_names[i].startswith("r_b.")]
+    if not positions:
+        return np.zeros(0, dtype=np.intp)
+    source = lin.generator or lin
+    driven = mechanics.second_order(source).S.values.any(axis=1)
+    base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
+    columns = np.concatenate((base, base + nv))
+    on_others = np.delete(source.A[:, columns], columns, axis=0)
+    if np.abs(on_others).max(initial=0.0) > _ROUNDING:
+        return base[:0]  # in rotating axes, each direction affects the others
+    return base
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -150,12 +150,8 @@ class Gain(ModelDesign):
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
         left = [name for name in self.state_names if self.regulated and name not in self.regulated]
-        why = (
-            "(not reached by any input, or determined by other states; "
-            "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds)"
-        )
         more = {
-            "not regulated": f"{listed(left)} {why}" if left else "",
+            "not regulated": f"{listed(left)} ({_why_not_regulated(left)})" if left else "",
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
         }
@@ -309,6 +305,20 @@ def cautions(gain: Gain) -> list[str]:
             "(type continuous in the URDF) to fly it as a wheel"
         )
     return said
+
+
+def _why_not_regulated(names: list[str]) -> str:
+    """Return the reasons why a gain does not regulate the named states."""
+    of_base = [name for name in names if name.startswith(("r_b.", "v_b."))]
+    reasons = list[str]()
+    if of_base:
+        reasons.append("no input pushes the base there")
+    if len(of_base) < len(names):
+        reasons.append(
+            "no input reaches the wheel states, or other states determine them; wheel_speeds=True "
+            "(--wheel-speeds) regulates all controllable wheel speeds"
+        )
+    return "; ".join(reasons)
 
 
 def _stopped_rotors(gain: Gain) -> list[str]:

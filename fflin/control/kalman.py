@@ -8,7 +8,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
-from fflin.analysis.reduction import outputs_of, regulated_part
+from fflin.analysis.reduction import (
+    outputs_of,
+    regulated_part,
+    unpushed_positions,
+    wheel_inputs,
+)
 from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
@@ -182,7 +187,9 @@ def kalman(
     For a sampled model, P satisfies the discrete-time Riccati equation. Both equations are solved
     by SciPy, and Newton's method refines the solution, as in `lqr`. For a model with reaction
     wheels, the filter estimates only the states that `lqr` regulates. It therefore uses only
-    outputs that depend on no other states.
+    outputs that depend on no other states. If a model has no wheels and no input pushes the base,
+    the filter estimates the base position and its rate only if outputs measure the position and the
+    disturbance pushes the base.
 
     Parameters
     ----------
@@ -233,7 +240,9 @@ def kalman(
     require_fixed_point(lin)
     noise, through = disturbance(lin, W, G)
     V = weight("V", V, lin.output_names, definite=True)
-    whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
+    noises = V
+    whole = lin
+    lin = _estimated_part(lin, through @ noise, wheel_speeds)
     S = selection(lin.state_names, whole.state_names)
     seen = outputs_of(whole, S)
     W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
@@ -260,6 +269,22 @@ def kalman(
         V=noises,
         estimated=lin.state_names,
     )
+
+
+def _estimated_part(lin: LinearModel, disturbed: Array, wheel_speeds: bool | None) -> LinearModel:
+    """Return the model of the estimated states: the states that `lqr` regulates, or all states.
+
+    A model without wheels whose inputs do not push the base is estimated completely if the outputs
+    measure the base position and the disturbance pushes the base. `disturbed` (nx, nw) maps the
+    disturbance to the state.
+    """
+    positions = unpushed_positions(lin)
+    if len(positions) and not (wheel_inputs(lin) or lin.wheels):
+        measured = lin.C[:, positions].any(axis=0).all()
+        pushed = disturbed[positions + len(lin.M)].any(axis=1).all()
+        if measured and pushed:
+            return lin
+    return regulated_part(lin, wheel_speeds)
 
 
 def lqg(gain: Gain, estimator: Estimator) -> Compensator:

@@ -68,14 +68,16 @@ def lqr(
     controllable modes decay as fast as without them (10.8). ``gain.weights`` states the
     bandwidth, decay rate and damping of the loop, and lists any modes that still decay more slowly.
 
-    For a model with reaction wheels, only the controllable states are regulated, see (9.4) of
-    docs/derivation.md; ``gain.regulated`` lists these states. The wheels are the joints in
-    ``lin.wheels``: each `ReactionWheel`, and each rotor that spins at the operating point or is
-    named in `Robot.wheel_joints`. Weights on the following states have no effect:
+    If no input pushes the base, its position and velocity are not regulated. Such inputs are, for
+    example, a base torque or reaction wheels, with or without joint torques. Of a model with
+    reaction wheels, only the controllable states are regulated, see (9.4) of docs/derivation.md.
+    The wheels are the joints in ``lin.wheels``: each `ReactionWheel`, and each rotor that spins at
+    the operating point or is named in `Robot.wheel_joints`. ``gain.regulated`` lists the regulated
+    states. Weights on the following states have no effect:
 
+    - the position and velocity of the base, along axes in which no input pushes the base;
     - wheel angles, which are ignorable;
-    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them;
-    - the position and velocity of the base, if no input pushes the base.
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them.
 
     Parameters
     ----------

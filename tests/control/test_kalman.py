@@ -107,6 +107,19 @@ def test_what_is_not_seen_or_not_disturbed_is_named(lin):
         fflin.kalman(fflin.linearize(robot, None, v), 1, 1)
 
 
+def test_a_position_that_no_input_pushes_is_estimated_if_it_can_be():
+    """Measured and disturbed, it is estimated; otherwise the filter of the attitude remains."""
+    hub = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(hub)
+    gain = fflin.lqr(lin)
+    assert fflin.kalman(lin, 1e-3, 1e-4).estimated == lin.state_names
+    by_torque = fflin.kalman(lin, 1e-3, 1e-4, G=lin.B)
+    assert by_torque.estimated == gain.regulated
+    positions = [name.startswith(("r_b", "v_b")) for name in lin.output_names]
+    assert sum(positions) == 6 and not by_torque.L[:, positions].any()
+    assert fflin.lqg(gain, by_torque).poles.real.max() < 0.0
+
+
 def test_parts_of_different_models_are_refused(lin):
     gain = fflin.lqr(lin, 1, 1)
     with pytest.raises(fflin.InputError, match="models"):

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 import fflin
 from fflin.control.gain import largest_gain
 from fflin.dynamics.integrators import held_cost
-from tests.support.messages import any_wording
-from tests.support.robots import BUNDLED, random_point
+from tests.support.messages import any_wording, says
+from tests.support.robots import BUNDLED, panels, random_point
 
 
 @pytest.fixture(scope="module")
@@ -176,17 +176,84 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
             fflin.lqr(point.discretize(dt) if dt else point, 1, 1)
 
     joints = [fflin.JointTorque(joint) for joint in robot.joint_names]
-    angular, linear = "angular momentum x/y/z", "linear momentum x/y/z"
-    refused(joints, f"stabilise {angular}, {linear}; add inputs.*_reduction")
-    refused([fflin.BaseTorque(), *joints], f"stabilise {linear}; add inputs")
-    refused([fflin.BaseForce(), *joints], f"stabilise {angular}; add inputs")
+    angular = "angular momentum x/y/z"
+    refused(joints, f"stabilise {angular}; add inputs, or design on .*_reduction")
+    refused([fflin.BaseForce(), *joints], f"stabilise {angular}; add inputs, or design")
+    oblique = fflin.Thruster(robot.model.frames[2].name, (0.0, 0.0, 0.0), (1, 1, 0))
+    refused([fflin.BaseTorque(), oblique, *joints], "stabilise linear momentum .*; add inputs, or")
     plane = [
         fflin.Thruster(robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction)
         for y, direction in ((0.1, (1, 0, 0)), (-0.1, (-1, 0, 0)), (0.1, (0, 1, 0)))
     ]
-    refused([*plane, *joints], "stabilise angular momentum x/y, linear momentum z; add inputs")
+    refused([*plane, *joints], "stabilise angular momentum x/y.*; add inputs, or design")
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     refused([*base, *joints[1:]], f"stabilise momentum of {robot.joint_names[0]}; .*--stiffness")
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_a_base_that_no_input_pushes_is_regulated_without_its_position(robots, name):
+    """The regulator equals the regulator of the model without the conserved linear momentum."""
+    robot = robots[name]
+    motors = [fflin.JointTorque(joint) for joint in robot.joint_names]
+    q = random_point(robot, np.random.default_rng(2))[0]
+    lin = fflin.linearize(robot.replace(inputs=[fflin.BaseTorque(), *motors]), q)
+    part = fflin.momentum_reduction(lin)
+    for model, reduced in ((lin, part), (lin.discretize(0.1), part.discretize(0.1))):
+        gain = fflin.lqr(model, 1.0, 1.0)
+        unpushed = {f"{group}.{axis}" for group in ("r_b", "v_b") for axis in "xyz"}
+        assert set(gain.state_names) - set(gain.regulated) == unpushed
+        expected = fflin.lqr(reduced, 1.0, 1.0).K @ part.S
+        assert gain.K == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())
+        assert says(str(gain), "v_b.z (no input pushes the base there)")
+        assert not says(str(gain), "wheel")
+
+
+def test_default_weights_of_a_base_torque_alone_have_the_documented_bandwidth():
+    hub = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    gain = fflin.lqr(fflin.linearize(hub))
+    assert np.abs(gain.poles) == pytest.approx(np.full(6, 0.2), rel=1e-6)
+    closed = fflin.acceleration_lqr(fflin.linearize(hub), 1.0, 1.0, 1.0)
+    assert closed.poles == pytest.approx(np.roots([1, 2**0.5, 0.5]).repeat(3))
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_modes_that_decay_by_themselves_are_not_blamed(dt):
+    """Equal panels: a torque moves one of their modes, a force the other; both decay."""
+    robot = panels(damping=0.2).replace(outputs=[fflin.Gyroscope("base")])
+
+    def about(*inputs):
+        lin = fflin.linearize(robot.replace(inputs=inputs))
+        return lin.discretize(dt) if dt else lin
+
+    torques = about(fflin.BaseTorque())
+    missed = fflin.controllability(torques).uncontrollable
+    assert any("q_m.h1" in name for name in missed)
+    assert fflin.lqr(torques, 1.0, 1.0).margin > 0.0
+    with pytest.raises(fflin.StabilizabilityError, match="angular momentum") as told:
+        fflin.lqr(about(fflin.BaseForce()), 1.0, 1.0)
+    assert "q_m" not in str(told.value) and "spring" not in str(told.value)
+    pushed = about(fflin.BaseTorque(), fflin.BaseForce())
+    unseen = fflin.observability(pushed).unobservable
+    assert any("q_m.h1" in name for name in unseen)
+    with pytest.raises(fflin.DetectabilityError, match=r"observe q_b\.x, .* r_b\.x") as told:
+        fflin.kalman(pushed, 1.0, 1.0)
+    assert "q_m" not in str(told.value)
+    # Without dampers the modes last, and they are blamed.
+    robot = panels(damping=0.0)
+    with pytest.raises(fflin.StabilizabilityError, match=r"vibration.*h1"):
+        fflin.lqr(about(fflin.BaseTorque()), 1.0, 1.0)
+
+
+def test_a_spring_is_advised_only_where_it_changes_a_momentum():
+    """A spring between links changes the momentum of a joint, but not of the whole robot."""
+    base = [fflin.BaseTorque(), fflin.BaseForce()]
+    loose = panels(damping=0.0).replace(stiffness={})
+    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of h1.*--stiffness.*--reduce"):
+        fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
+    hub = fflin.load("cubesat", inputs=[fflin.BaseForce()])
+    with pytest.raises(fflin.StabilizabilityError, match=r"angular momentum.*--reduce") as told:
+        fflin.lqr(fflin.linearize(hub))
+    assert "spring" not in str(told.value)
 
 
 def test_springs_do_not_hide_that_momentum_is_conserved():

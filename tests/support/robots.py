@@ -73,6 +73,24 @@ def free_body(inertia, name="body"):
     return fflin.from_model(model, name=name)
 
 
+def panels(damping):
+    """Return a hub with two equal panels on springs, whose hinges h1 and h2 have no motors."""
+    hub = pin.Inertia(100.0, np.zeros(3), np.diag((20.0, 25.0, 30.0)))
+    model = pin.Model()
+    model.name = "panels"
+    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    model.addJointFrame(base)
+    model.appendBodyToJoint(base, hub, pin.SE3.Identity())
+    model.addBodyFrame("base", base, pin.SE3.Identity(), -1)
+    for name, side in (("h1", 1.0), ("h2", -1.0)):
+        place = pin.SE3(np.eye(3), np.array((0.0, 0.5 * side, 0.0)))
+        joint = model.addJoint(base, pin.JointModelRX(), place, name)
+        panel = pin.Inertia(4.0, np.array((0.0, 0.8 * side, 0.0)), np.diag((0.5, 0.1, 0.5)))
+        model.appendBodyToJoint(joint, panel, pin.SE3.Identity())
+    robot = fflin.from_model(model)
+    return robot.replace(inputs=[fflin.BaseTorque()], stiffness=30.0, damping=damping)
+
+
 def singular_at(value):
     """A robot whose M is singular where its last joint is at a value: a point mass on its axis."""
     model = pin.Model()
