@@ -178,9 +178,11 @@ class FlexibleAppendage(FrozenArrays):
 
         Raises
         ------
+        FileError
+            If a file, or a file that it includes, is missing, too large or not a regular file.
         InputError
-            If a file is missing, truncated or not a Craig-Bampton model, or pyYeti is not
-            installed (``pip install 'fflin[nastran]'``).
+            If a file is truncated or not a Craig-Bampton model, or pyYeti is not installed (``pip
+            install 'fflin[nastran]'``).
         UnknownNameError
             If a unit is unknown.
         """
