@@ -6,10 +6,13 @@ from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
 
-# _CONTROL matches control characters, which could break a line or control the terminal. _LONG_NAME
-# matches names that are too long to read; each part of a path counts as a name. _LONGEST is the
-# largest length of a message.
-_CONTROL, _LONG_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]"), re.compile(r"[^\s/\\]{100,}")
+# _CONTROL matches control characters, which could break a line or control the terminal, and lone
+# surrogates, which no encoding can print. Python reads a byte of a path that is not UTF-8 as a
+# surrogate.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+# _LONG_NAME matches names that are too long to read; each part of a path counts as a name. _LONGEST
+# is the largest length of a message.
+_LONG_NAME = re.compile(r"[^\s/\\]{100,}")
 _LONGEST = 1000
 # Matches a line break before an indented line. Messages of other packages contain such line breaks.
 _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
@@ -290,5 +293,6 @@ def optional_package(name: str, needed: str, extra: str) -> ModuleType:
 def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
     """Raise `UnknownNameError` for the first unknown name, if any."""
     for name in names:
-        if name not in known:
+        # Arrays cannot be compared with names, and lists are not keys.
+        if not isinstance(name, str) or name not in known:
             raise unknown(kind, name, known)

@@ -1,5 +1,6 @@
 """Progress bar on stderr, checks of the import path, and a limit on the threads of BLAS."""
 
+import math
 import os
 import sys
 import time
@@ -71,6 +72,14 @@ class Progress:
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
     """Return `sys.path` without the entries that lead to the given folders."""
     return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
+
+
+def memory() -> float:
+    """Return the size of the machine's memory [bytes], or infinity if it is unknown."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):  # this system does not report the size
+        return math.inf
 
 
 def same_file(first: str | os.PathLike[str], second: str | os.PathLike[str]) -> bool:

@@ -21,18 +21,20 @@ import io
 import json
 import re
 import warnings
+import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from fflin.base import writing
 from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.process import memory
 from fflin.base.validation import Array, Result, normalised
 
 CHECKSUM = "sha256"
@@ -45,6 +47,9 @@ DAMAGED = f"its content does not match its {CHECKSUM}: the file was damaged or e
 _BLOCK = 2**22
 _LARGEST = 1e300
 _JSON_CHECKSUM = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
+# A file begins with a header, whose first part is a text. _MAT_COMPRESSED is the type of compressed
+# elements.
+_MAT_HEADER, _MAT_COMPRESSED = 128, 15
 _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 # Matches the remains of a damaged header that contained a digest.
 _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
@@ -97,8 +102,8 @@ def require_finite(record: Mapping[str, object]) -> None:
 
 
 def text(value: object) -> str:
-    """Return a string from a record."""
-    return value if isinstance(value, str) else str(np.asarray(value).item())
+    """Return a string from a record, or raise `InputError`."""
+    return value if isinstance(value, str) else str(_single(value, "a text"))
 
 
 def texts(value: object) -> tuple[str, ...]:
@@ -108,8 +113,20 @@ def texts(value: object) -> tuple[str, ...]:
 
 
 def figure(value: object) -> float:
-    """Return a number from a record."""
-    return float(np.asarray(value).item())
+    """Return a number from a record, or raise `InputError`."""
+    single = _single(value, "a number")
+    try:
+        return float(single)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{value!r} is in the place of a number") from None
+
+
+def _single(value: object, expected: str) -> object:
+    """Return the only entry of a value from a record, or raise `InputError`."""
+    try:
+        return np.asarray(value).item()
+    except ValueError:  # several entries, none, or rows of different lengths
+        raise InputError(f"{value!r} is in the place of {expected}") from None
 
 
 def figures(value: object) -> dict[str, float]:
@@ -149,6 +166,7 @@ def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
 
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        _require_room(sum(entry.file_size for entry in file.zip.infolist()))
         record = {key: file[key] for key in file.files}
     # The last 22 bytes of the archive contain the number of its entries. If a damaged length field
     # hides some entries, NumPy reads fewer entries than this number.
@@ -191,6 +209,7 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
         raise ValueError(f"{_other_format(content)}; save it with save -v7 (MATLAB and Octave)")
+    _require_room(_unpacked_size(content))
     record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
@@ -204,6 +223,36 @@ def _other_format(content: bytes) -> str:
     if content.startswith((b"# Created by Octave", b"Octave-1")):
         return "a file of Octave's own format"
     return "not a MATLAB file of level 5"
+
+
+def _unpacked_size(content: bytes) -> int:
+    """Return the size [bytes] of a .mat file after decompression, or more than the memory.
+
+    An element begins with its type and its size. Compressed elements are decompressed in pieces
+    that are thrown away, and only until their size exceeds the memory.
+    """
+    order: Literal["little", "big"] = "little" if content[126:128] == b"IM" else "big"
+    data = memoryview(content)
+    at, total = _MAT_HEADER, 0
+    while at + 8 <= len(data):
+        kind = int.from_bytes(data[at : at + 4], order)
+        size = int.from_bytes(data[at + 4 : at + 8], order)
+        body = data[at + 8 : at + 8 + size]
+        total += len(body)
+        if kind == _MAT_COMPRESSED:
+            unpacking = zlib.decompressobj()
+            while body and total <= memory() and not unpacking.eof:
+                total += len(unpacking.decompress(body, _BLOCK))
+                body = unpacking.unconsumed_tail
+        at += 8 + size
+    return total
+
+
+def _require_room(size: int) -> None:
+    """Raise `MemoryError` before `size` bytes are unpacked, if they may not fit into memory."""
+    # The arrays of a record are copied once while they are read.
+    if 2 * size > memory():
+        raise MemoryError
 
 
 def _of_mat(value: object) -> object:

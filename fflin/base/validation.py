@@ -43,6 +43,12 @@ ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 NOT_VERIFIED = "not verified: the file has no sha256, so that damage cannot be detected"
 
+# Largest number of things that one call makes, such as samples, robots or points.
+MOST = 1_000_000
+
+# Largest magnitude of a physical quantity, so that products of a few quantities do not overflow.
+LARGEST = 1e50
+
 # Native double precision. NumPy has only one object for this type, so `is` can replace `==`.
 DOUBLE = np.dtype(np.float64)
 
@@ -91,6 +97,15 @@ def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
     return found
 
 
+def quantity(name: str, value: object, unit: str = "") -> float:
+    """Return a number above 0 and up to `LARGEST`, or raise `InputError`."""
+    found = positive(name, value, unit)
+    if found > LARGEST:
+        shown = f"{found:g} {unit}".rstrip()
+        raise InputError(f"{name} is {shown}, expected at most {LARGEST:g}")
+    return found
+
+
 def share(name: str, value: object) -> float:
     """Return a fraction above 0 and below 1, or raise `InputError`."""
     found = number(name, value)
@@ -127,6 +142,23 @@ def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int
         bound = f"of at least {least}" if value < least else f"of at most {largest:,}"
         raise InputError(f"{name} is {value}, expected a whole number {bound}")
     return int(value)
+
+
+def count(name: str, value: object, least: int = 1, largest: int = MOST) -> int:
+    """Return how many things a call makes, or raise `InputError`.
+
+    The number is limited before memory is taken for the things. If the store of the things checks
+    its own size, call `whole` instead.
+    """
+    return whole(name, value, least, largest)
+
+
+def printable(name: str, value: object) -> str:
+    """Return a name that files, tables and terminals can show, or raise `InputError`."""
+    text = instance(name, value, str, "a string")
+    if not text.strip() or not text.isprintable():
+        raise InputError(f"{name} is {text!r}, expected a name of printable characters")
+    return text
 
 
 def by_name(name: str, value: object, of_what: str) -> Mapping[str, object]:

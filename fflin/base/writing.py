@@ -50,19 +50,26 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 
 def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
+    require_regular(path, kind, limit)
+    with failing(path, "read"), path.open("rb") as file:
+        return file.read(-1 if limit is None else limit)
+
+
+def require_regular(path: Path, kind: str, limit: int | None = None) -> None:
+    """Register an input file that another package reads, or raise `FileError`.
+
+    The file must be a regular file of at most `limit` bytes. Other files are not opened: a pipe
+    would block until another process writes into it, and a device may have no end.
+    """
     with failing(path, "read"):
-        # Only regular files are opened, because opening a pipe would block until another process
-        # writes into it.
-        if path.exists() and not path.is_file():
-            what = "a folder" if path.is_dir() else "not a regular file"
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            what = "a folder" if stat.S_ISDIR(found.st_mode) else "not a regular file"
             raise FileError(f"{path}: is {what}; give the path of a {kind} file")
-        with path.open("rb") as file:
-            content = file.read(-1 if limit is None else limit + 1)
-    if limit is not None and len(content) > limit:
+    if limit is not None and found.st_size > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
     remember(path)
-    return content
 
 
 @contextmanager

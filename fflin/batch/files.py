@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from fflin.base import writing
 from fflin.base.errors import FileError, InputError, optional_package
+from fflin.base.process import memory
 from fflin.base.record import CHECKSUM, DAMAGED, content_digest, verify_checksum
 from fflin.base.validation import Array
 
@@ -179,7 +180,7 @@ class MemoryStore:
         self.count, self.chunk, self.arrays = count, chunk, dict(given or {})
         self._finished = set[int]()  # first rows of the finished chunks
         try:
-            if 8 * count * sum(map(math.prod, shapes.values())) > _memory():
+            if 8 * count * sum(map(math.prod, shapes.values())) > memory():
                 raise MemoryError
             for key, shape in shapes.items():
                 if key not in self.arrays:
@@ -347,14 +348,6 @@ def _reserve(path: Path, size: int) -> None:
     with path.open("ab") as file:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(file.fileno(), 0, size)
-
-
-def _memory() -> float:
-    """Return the size of the machine's memory [bytes], or infinity if it is unknown."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):  # this system does not report the size
-        return math.inf
 
 
 def require_room(path: Path, size: int) -> None:

@@ -17,7 +17,7 @@ from fflin.base import intervals
 from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import CODECS, reading
-from fflin.base.validation import Array, FrozenArrays, Mask, share, whole
+from fflin.base.validation import Array, FrozenArrays, Mask, dimension, instance, share, whole
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
@@ -229,7 +229,7 @@ class Campaign(FrozenArrays):
 
     def figure(self, name: str) -> tuple[Array, str]:
         """Return the named figure of every run (N,), and its unit."""
-        name = kind_named(name)
+        name = kind_named(instance("name", name, str, "the name of a figure"))
         if name == "end":
             return self.end, "s"
         if name == "settle":
@@ -277,6 +277,7 @@ class Campaign(FrozenArrays):
             run that was stopped early never meets a condition given as text.
         """
         if not isinstance(condition, str):
+            dimension("condition", condition)  # refuses rows of different lengths
             found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
             if found.shape != (len(self),) or found.dtype != bool:
                 raise InputError(
@@ -342,7 +343,7 @@ class Campaign(FrozenArrays):
         the value, or ``|NAME|`` for the distance. For example, the distance is more informative for
         a figure that grows with an initial error of either sign. The default figure is `about`.
         """
-        figure = self.values(name or self.about)
+        figure = self.values(self.about if name is None else name)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
         signed, sized = (intervals.rank_correlations(x, figure) for x in (self.drawn, apart))
         found = {

@@ -29,7 +29,6 @@ from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
-_MOST = 1_000_000
 _ROUNDING = 1e-12  # eigenvalues of the scaled P up to this fraction of the largest count as zero
 
 # The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
@@ -352,7 +351,7 @@ def funnel(
     policy, expected = followed(schedule, robot), "a GainSchedule or a TrajectoryFeedback"
     feedback = validation.instance("schedule", policy, TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
-    samples = validation.whole("samples", samples, 1, _MOST)
+    samples = validation.count("samples", samples)
     seed = validation.whole("seed", seed, 0)
     confidence = validation.share("confidence", confidence)
     by_level = not isinstance(goal, Mapping)
@@ -499,8 +498,9 @@ def _indices(
             "trajectory"
         )
     if validation.dimension("knots", knots) == 0:
-        count = validation.whole("knots", knots, 1)
-        chosen = both[np.linspace(0, len(both) - 1, count).round().astype(int)]
+        # More knots than the schedule has are all of its knots.
+        wanted = min(validation.whole("knots", knots, 1), len(both))
+        chosen = both[np.linspace(0, len(both) - 1, wanted).round().astype(int)]
     else:
         times = validation.as_double("knots", knots).ravel()
         times = validation.vector("knots", times, times.size, "times of knots")

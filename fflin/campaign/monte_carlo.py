@@ -16,7 +16,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import FileError, InputError, require_known
 from fflin.base.record import content_digest, reading
-from fflin.base.validation import Array, instance, share, truth, whole
+from fflin.base.validation import Array, count, instance, share, truth, whole
 from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
@@ -199,7 +199,7 @@ def monte_carlo(
     width, confidence = share("width", width), share("confidence", confidence)
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else files.output_path(out)
-    options |= {"duration": duration, "histories": whole("histories", histories, 0)}
+    options |= {"duration": duration, "histories": count("histories", histories, 0)}
     job = CampaignJob(robot, policy, dispersions, seed, engine, options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     size = _chunk(runs, chunk, how.count(job), staged=until is not None)

@@ -134,6 +134,12 @@ def _spread(value: object) -> object:
     raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
+# Distributions of the Kolmogorov-Smirnov statistic, whose `ppf` takes minutes for large samples
+# and cannot be interrupted. The limit is the largest sample size n.
+_SLOW = ("ksone", "kstwo")
+_LARGEST_SAMPLE = 1000
+
+
 def _distribution(distribution: str, given: Mapping[str, object]) -> object:
     from scipy import stats
 
@@ -146,6 +152,8 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
         for key, value in given.items():
             if not is_number(value):
                 raise ValueError(f"has {key} = {reprlib.repr(value)}, expected a finite number")
+        if distribution in _SLOW and number("n", given.get("n", 1)) > _LARGEST_SAMPLE:
+            raise ValueError(f"has n = {given['n']}, expected at most {_LARGEST_SAMPLE}")
         frozen = kind(**given)
         if abs(float(frozen.ppf(0.5))) < 1e100:
             return frozen

@@ -11,7 +11,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, Indices, number, share, whole
+from fflin.base.validation import Array, FrozenArrays, Indices, count, number, share, whole
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
@@ -23,7 +23,6 @@ from fflin.robot.robot import Robot
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-_MOST = 1_000_000  # largest number of random runs
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
 TRUSTED = 0.1  # largest accepted relative prediction error
 
@@ -229,7 +228,8 @@ def validity(
     """
     loop = Loop(robot, lin, gain)
     largest = _checked_displacement(loop.lin, attitude, position, joint)
-    samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
+    samples = count("samples", samples)
+    seed = whole("seed", seed, 0)
     confidence = share("confidence", confidence)
     how = Execution(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples

@@ -121,10 +121,19 @@ def parameter_range(text: str) -> tuple[str, object]:
     return name, {"range": found, "tied": True} if tied else found
 
 
+# Largest number of values of one joint in a grid. They are all in memory.
+_MOST_POINTS = 1_000_000
+
+
 def grid_axis(text: str) -> tuple[str, tuple[float, float, int]]:
     """Read JOINT=LO:HI:N."""
     name, (*ends, points) = _parts(text, "JOINT=LO:HI:N, such as joint_1=-1:1:21", 3)
-    low, high, count = *map(number, ends), count_of(points)
+    low, high = map(number, ends)
+    count = count_of(points)
+    if count > _MOST_POINTS:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' has too many points, expected at most {_MOST_POINTS:,} for each joint"
+        )
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty; LO must be less than HI")
     return name, (low, high, count)

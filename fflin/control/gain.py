@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import InputError, listed
+from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import Design
 from fflin.base.tables import cut, grid, matrix, width
@@ -139,6 +139,13 @@ class Gain(ModelDesign):
     placement: Vector
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        states = self.regulated or self.state_names
+        require_known("state", states, self.state_names)
+        if len(self.poles) != len(states):
+            raise InputError(f"{len(self.poles)} poles for {len(states)} regulated states")
 
     def _report(self) -> str:
         """Return the report with the gain, poles, residual, margins, weights and warnings."""

@@ -245,7 +245,12 @@ def kalman(
     lin = _estimated_part(lin, through @ noise, wheel_speeds)
     S = selection(lin.state_names, whole.state_names)
     seen = outputs_of(whole, S)
-    W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
+    with np.errstate(over="ignore", invalid="ignore"):
+        W = S @ through @ noise @ through.T @ S.T
+        V = seen @ V @ seen.T
+    for name, covariance in (("W", W), ("V", V)):
+        if not np.isfinite(covariance).all():
+            raise InputError(f"{name} is so large that its product with the model overflows")
     W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
     C = np.ascontiguousarray(lin.C)

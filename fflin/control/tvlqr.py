@@ -154,8 +154,12 @@ class GainSchedule(Schedule):
         """P (nx, nx) as a function of time, by cubics that match P and dP/dt at the knots."""
         from scipy.interpolate import CubicHermiteSpline
 
-        drift, spent = self.P @ self.A, self.K.mT @ self.R @ self.K
-        return CubicHermiteSpline(self.t, self.P, spent - drift - drift.mT - self.Q)
+        drift = self.P @ self.A
+        spent = self.K.mT @ self.R @ self.K
+        slopes = spent - drift - drift.mT - self.Q
+        if not np.isfinite(slopes).all():
+            raise np.linalg.LinAlgError("P changes too fast")
+        return CubicHermiteSpline(self.t, self.P, slopes)
 
     @cached_property
     def pieces(self) -> Array:
@@ -339,7 +343,8 @@ def tvlqr(
         return np.array((A, B @ np.linalg.solve(R, B.mT), np.broadcast_to(Q, A.shape)))
 
     residual = 0.0
-    with riccati.bounded_by("smaller weights or a larger R"):
+    remedy = "smaller weights or a larger R"
+    with riccati.bounded_by(remedy):
         if sample is not None:
             stages = list(held_stages(traj, dt, Q, R))
             gains, costs, residual = riccati.samples_back(reversed(stages), Qf)
@@ -366,7 +371,10 @@ def tvlqr(
         weights=rule,
         knots=traj.t,
     )
-    return schedule if dt else replace(schedule, residual=schedule.defect(at))
+    if dt:
+        return schedule
+    with riccati.bounded_by(remedy):
+        return replace(schedule, residual=schedule.defect(at))
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:

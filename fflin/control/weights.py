@@ -156,7 +156,10 @@ def cost_weights(
     R = weight("R", R, input_keys(of), definite=True)
     cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
     if cross.any():
-        reduced = Q - cross @ np.linalg.solve(R, cross.T)
+        with np.errstate(over="ignore", invalid="ignore"):
+            reduced = Q - cross @ np.linalg.solve(R, cross.T)
+        if not np.isfinite(reduced).all():
+            raise InputError("N R^-1 N' overflows; give a smaller N or a larger R")
         require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
     return Q, R, cross
 

@@ -229,12 +229,15 @@ def held_cost(F: Array, W: Array, h: float | Array) -> Array:
 
     h, n = np.asarray(h)[..., None, None], F.shape[-1]
     rate, weight = (float(np.abs(X).sum(axis=-2).max()) or 1.0 for X in (F, W))
-    doublings = math.ceil(math.log2(max(2.0 * float(h.max()) * rate, 1.0)))
+    # The logarithms are added, because the product of the two numbers may overflow.
+    longest = float(h.max())
+    halvings = 1.0 + math.log2(rate) + math.log2(longest) if longest else 0.0
+    doublings = max(math.ceil(halvings), 0)
     block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
     size = weight / rate
     block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
-        exponential = expm(block * (h / 2**doublings))
+        exponential = expm(block * np.ldexp(h, -doublings))
         step = exponential[..., n:, n:]
         total: Array = step.mT @ exponential[..., :n, n:]
         for _ in range(doublings):

@@ -23,7 +23,7 @@ from fflin.base import __version__
 from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
-from fflin.base.writing import as_path, failing, write_atomically
+from fflin.base.writing import as_path, failing, read_file, write_atomically
 from fflin.control.policies import Loop, Measure, Policy
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.outputs import Measuring
@@ -36,6 +36,7 @@ _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
 # Valid names, without those of headers that the code or the C library includes.
+_LARGEST = 2**26  # of each file of a law [bytes]
 _NAME = r"(?!(features|float|math|std\w*)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 
@@ -151,8 +152,9 @@ def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
 def _description(path: Path) -> dict[str, Any]:
     """Return the description of C code, or raise `FileError` if a file was edited."""
     with reading(path, "description of C code"):
-        about: dict[str, Any] = json.loads(path.read_bytes())
-        header, code = (path.with_suffix(ending).read_bytes() for ending in (".h", ".c"))
+        about: dict[str, Any] = json.loads(read_file(path, ".json", _LARGEST))
+        header = read_file(path.with_suffix(".h"), "C header", _LARGEST)
+        code = read_file(path.with_suffix(".c"), "C", _LARGEST)
         if about.pop("sha256") != digest_of(about, header, code):
             raise FileError(
                 f"{path}: does not belong to its .c and .h files, or one of these files was "

@@ -228,6 +228,7 @@ def arguments(
         raise FileError(
             f"the file has the entries {found}; expected t, u, and either x or both q and v"
         )
+    t = as_double("t", entries["t"]).ravel()
     pose = as_double("placement", entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0]))
     pose = vector("placement", pose.ravel(), 7, "a position and a quaternion x, y, z, w")
     quaternion = normalised("the quaternion placement[3:7]", pose[3:])
@@ -235,6 +236,8 @@ def arguments(
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
     u = u[:, None] if u.ndim == 1 else u
+    if u.ndim != 2:
+        raise InputError(f"u has shape {u.shape}, expected one row of inputs for each knot")
     names, there = actuation.names, texts(entries.get("input_names", actuation.names))
     if names != there or u.shape[-1] != len(names):
         lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
@@ -248,7 +251,7 @@ def arguments(
     for columns in actuation.held:
         # Rotate base torques and forces from reference axes to world axes.
         u[:, columns] = u[:, columns] @ reference.rotation.T
-    found_as: dict[str, object] = {"t": np.ravel(entries["t"]), "u": u}
+    found_as: dict[str, object] = {"t": t, "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}
     if states:
         return found_as | {name: entries[name] for name in "qv"}

@@ -47,6 +47,9 @@ _CAUSES = (
 # largest velocities and accelerations of the motion.
 _ACCURACY, _MOST_STEPS = 1e-8, 128
 
+# Two durations with at most this relative difference count as equal.
+_SAME_TIME = 1e-9
+
 # Assumed rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest
 # position. An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to
 # the sum of the magnitudes of the terms.
@@ -238,12 +241,15 @@ class Trajectory(Design):
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""
-        dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
+        dt = number("dt", dt)
+        duration = float(self.t[-1] - self.t[0])
         if not dt >= 1e-7 * duration:
             raise InputError(
                 f"dt is {dt:g} s, expected at least 1e-7 of the duration of {duration:g} s"
             )
-        times: Array = self.t[0] + dt * np.arange(int(duration / dt * (1.0 + 1e-9)) + 1)
+        if not dt <= duration * (1.0 + _SAME_TIME):
+            raise InputError(f"dt is {dt:g} s, expected at most the duration of {duration:g} s")
+        times: Array = self.t[0] + dt * np.arange(int(duration / dt * (1.0 + _SAME_TIME)) + 1)
         if abs(times[-1] - self.t[-1]) <= 1e-6 * dt:
             times[-1] = self.t[-1]
         return times
@@ -339,6 +345,7 @@ class Trajectory(Design):
         from fflin.linear.files import read
 
         source = as_path(path)
+        instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         values = read(source, robot, hold, frame)
         with located(str(source)):
             return Trajectory(robot, **values)
@@ -499,6 +506,7 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
             "the motion was read from a file, which does not contain its robot; give the robot, "
             "motion.trajectory(robot)"
         )
+    instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
     entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
     from fflin.linear.files import arguments
 

@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
 from fflin.base.toml_file import TomlFile, flat
-from fflin.base.validation import by_name, instance, is_rotation, rotated
+from fflin.base.validation import by_name, instance, is_rotation, printable, rotated
 from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
@@ -212,7 +212,8 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
-    instance("name", name, (str, type(None)), "a string")
+    if instance("name", name, (str, type(None)), "a string"):
+        printable("name", name)
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"

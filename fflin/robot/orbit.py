@@ -148,9 +148,12 @@ class CircularOrbit:
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
         """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
-        parts = json.loads(text)
-        n = parts.pop("mean_motion")
-        orbit = cls(**parts)
+        try:
+            parts = json.loads(text)
+            n = parts.pop("mean_motion")
+            orbit = cls(**parts)
+        except (AttributeError, KeyError, TypeError, json.JSONDecodeError):
+            raise InputError(f"{text!r} is not the JSON text of an orbit") from None
         object.__setattr__(orbit, "mean_motion", positive("mean_motion", n))
         return orbit
 

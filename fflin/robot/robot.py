@@ -452,6 +452,8 @@ class Robot(Coordinates):
         InputError
             If the name belongs to a mimic joint, a wheel without inertia or a locked joint.
         """
+        if not isinstance(name, str):
+            raise unknown("joint", name, self.joint_names)
         if found := next((joint for joint in self.joints if joint.name == name), None):
             return found
         leader = next((x.leader.name for x in self.followers if x.joint.name == name), "")

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, printable
 from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
 from fflin.robot.inputs import ReactionWheel
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
@@ -116,7 +116,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     names PREFIX.NAME. No inputs act on its joints.
     """
     bare = robot._bare
-    if not prefix or "." in prefix:
+    if "." in printable("prefix", prefix):
         raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
     taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
     if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):

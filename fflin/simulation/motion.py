@@ -129,6 +129,11 @@ class Motion(StatesAndInputs, Design):
     True
     """
 
+    _SHAPES = (
+        "t:t q:tq v:tv x:tx u:tu momentum:tm state_names:x input_names:u "
+        "wheels:w wheel_inertias:w modes:k mode_rotations:k phases:p starts:p"
+    )
+
     t: Vector
     q: Array
     v: Array
@@ -168,6 +173,9 @@ class Motion(StatesAndInputs, Design):
         count = len(self.t)
         if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
             raise InputError(f"a motion has {count} times; every history needs as many rows")
+        of_target = self.target.shape[-1] if self.target.ndim else 1
+        if self.target.size and of_target != self.x.shape[1] != self.target.size:
+            raise InputError(f"the target has shape {self.target.shape}, expected a state or rows")
         if self.target.size in (0, self.x.shape[1]):  # .mat files have no vectors
             object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # .json files have no empty matrices
@@ -301,7 +309,7 @@ class Motion(StatesAndInputs, Design):
         extrapolated, because they are not recorded. `robot` is required only if the motion was read
         from a file.
         """
-        return along(self, robot or self._robot)
+        return along(self, self._robot if robot is None else robot)
 
     @property
     def passed(self) -> tuple[Passed, ...]:

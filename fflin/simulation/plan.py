@@ -443,8 +443,13 @@ def _require_possible(
         )
 
 
+_COUNTABLE = 2**53  # a double represents every whole number up to this one
+
+
 def _in_steps(name: str, time: float, dt: float) -> int:
     """Convert a time [s] to a number of steps; raise `InputError` unless it is a multiple of dt."""
+    if time / dt > _COUNTABLE:
+        raise InputError(f"{name} is {time:g} s, which is too many steps of dt = {dt:g} s")
     if abs(round(time / dt) * dt - time) > 1e-6 * dt:
         raise InputError(
             f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "

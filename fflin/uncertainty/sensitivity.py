@@ -236,6 +236,7 @@ class Sensitivity:
             ``link_3``, or a pattern such as ``*.density``. Bodies whose links are listed are
             omitted.
         """
+        instance("only", only, (str, type(None)), "the name of a kind, a link or a pattern")
         shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
         rows = []

@@ -7,7 +7,17 @@ from itertools import permutations
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, by_name, instance, number, numbers, untied, vector, whole
+from fflin.base.validation import (
+    Array,
+    by_name,
+    count,
+    instance,
+    number,
+    numbers,
+    untied,
+    vector,
+    whole,
+)
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
@@ -18,6 +28,9 @@ from fflin.uncertainty.worst import Worst, searched
 
 # Ranges are refused if the number of rejected draws per valid draw exceeds this.
 _TRIES = 1000
+
+# Largest number of robots in a list; a robot takes about 50 kB.
+_MOST_ROBOTS = 100_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,9 +139,10 @@ class Uncertain:
 
         A draw is rejected if the robot with these deltas is not physically realisable.
         """
-        count, draw = whole("n", n, 1), np.random.default_rng(whole("seed", seed, 0))
+        wanted = count("n", n)
+        draw = np.random.default_rng(whole("seed", seed, 0))
         found, lost = list[Array](), 0
-        while len(found) < count:
+        while len(found) < wanted:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
             if not (why := self.refusal(delta)):
                 found.append(delta)
@@ -163,9 +177,10 @@ class Uncertain:
         Raises
         ------
         InputError
-            If almost none of the drawn robots is physically realisable.
+            If n is above 100,000, or almost none of the drawn robots is physically realisable.
         """
-        return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
+        deltas, _ = self.draws(count("n", n, largest=_MOST_ROBOTS), seed=seed)
+        return [self.at(self.values(delta)) for delta in deltas]
 
     def worst(
         self, gain: object, q: Array | None = None, *, samples: int = 200, seed: int = 0
@@ -203,7 +218,7 @@ class Uncertain:
             If K has a wrong size, the loop at the middle of the ranges is unstable, or `lft` raises
             an `InputError` for this robot.
         """
-        return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
+        return searched(self, self.lft(q), gain, count("samples", samples), seed)
 
 
 def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:

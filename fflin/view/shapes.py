@@ -5,20 +5,24 @@ Meshes are read from their files and simplified.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
+from urllib.parse import unquote
+from xml.parsers.expat import ExpatError, ParserCreate
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinError
 from fflin.base.validation import Array
-from fflin.base.writing import read_file, reason, shown
+from fflin.base.writing import read_file, reason, require_regular, shown
 from fflin.robot.catalog import find_mesh
 from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
 from fflin.robot.joints import ROOT, Carried, find_frame, find_joint
@@ -324,6 +328,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
 
 @lru_cache(maxsize=256)
 def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
+    _require_plain(path)
     # The key of the cache contains the file's size and modification time, so a changed file is read
     # again.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
@@ -331,6 +336,8 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
     if not corners.size or not np.isfinite(corners).all():
         raise ValueError(f"{path}: has no triangles")
+    if np.abs(corners).max() > _FARTHEST:
+        raise ValueError(f"{path}: is larger than {_FARTHEST:g} m; check its unit")
     extent = float(np.ptp(corners, axis=0).max()) or 1.0  # 0 if all corners coincide
     resolution = _RESOLUTION
     while True:
@@ -345,6 +352,83 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
     if not seen:
         raise ValueError(f"{path}: has no triangle large enough to be visible")
     return seen
+
+
+# Largest size of a mesh file, and of a file to which it refers [bytes].
+_LARGEST_FILE = 2**28
+_MOST_NODES = 100_000  # of a COLLADA file
+_FARTHEST = 1e12  # largest coordinate [m]; pages have numbers of single precision
+
+
+def _require_plain(path: Path) -> None:
+    """Raise ValueError if a mesh file could stop the libraries that read it.
+
+    The file and all files to which it refers must be regular files of a bounded size, because a
+    library waits for a pipe forever. The nodes of a COLLADA file must not contain themselves,
+    because a library follows them until Python crashes.
+    """
+    kind = path.suffix.lower()
+    try:
+        content = read_file(path, "mesh", _LARGEST_FILE)
+        for name in _references(kind, content):
+            file = path.parent / name
+            # A missing file is skipped by the libraries.
+            if file.exists():
+                require_regular(file, "material or buffer", _LARGEST_FILE)
+        if kind == ".dae":
+            _require_no_cycle(content)
+    except (FflinError, ExpatError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read: {reason(error)}") from None
+
+
+def _references(kind: str, content: bytes) -> list[str]:
+    """Return the paths to which a mesh file refers, as they are written in the file."""
+    if kind == ".obj":
+        lines = content.decode("utf-8", "replace").splitlines()
+        named = [line.split(maxsplit=1) for line in lines if line.lstrip().startswith("mtllib")]
+        return [words[1].strip() for words in named if len(words) > 1]
+    if kind == ".gltf":
+        table = json.loads(content)
+        parts = [*table.get("buffers", ()), *table.get("images", ())]
+        found = [unquote(part["uri"]) for part in parts if "uri" in part]
+        return [uri for uri in found if not uri.startswith("data:")]
+    return []
+
+
+def _require_no_cycle(content: bytes) -> None:
+    """Raise ValueError if a node of a COLLADA file contains itself, directly or through others."""
+    contained: dict[str, list[str]] = {}
+    around: list[str] = []
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        name = tag.rpartition(":")[2]
+        inside = around[-1] if around else ""
+        if name == "node":
+            own = attributes.get("id") or f" {len(contained)}"
+            contained.setdefault(inside, []).append(own)
+            contained.setdefault(own, [])
+            around.append(own)
+        elif name == "instance_node":
+            contained.setdefault(inside, []).append(attributes.get("url", "").removeprefix("#"))
+
+    def end(tag: str) -> None:
+        if tag.rpartition(":")[2] == "node":
+            around.pop()
+
+    parser = ParserCreate()
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = end
+    parser.Parse(content, True)
+    try:
+        order = list(TopologicalSorter(contained).static_order())
+    except CycleError:
+        raise ValueError("a node contains itself") from None
+    # Nodes are drawn as often as they are contained, so their number can double at every level.
+    drawn = dict.fromkeys(order, 1)
+    for name in order:
+        drawn[name] += sum(drawn[each] for each in contained.get(name, ()))
+        if drawn[name] > _MOST_NODES:
+            raise ValueError(f"more than {_MOST_NODES:,} nodes")
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:

@@ -46,6 +46,7 @@ FORMATS = {
 } | dict.fromkeys(
     ("model", "gain", "schedule", "estimator", "motion", "gains"), (".npz", ".mat", ".json")
 )
+OTHERS = ["gain", "model", "estimator", "compensator", "motion", "schedule"]
 CASES = [(kind, ending) for kind, endings in FORMATS.items() for ending in endings]
 
 
@@ -363,3 +364,89 @@ def test_sparse_matrices_of_matlab_are_read(tmp_path):
     savemat(tmp_path / "x.mat", {"A": scipy.sparse.csc_matrix(A)})
     found, _ = read_record(tmp_path / "x.mat")
     assert np.array_equal(found["A"], A)
+
+
+# Values that programs, or attackers, may write in the place of an entry.
+WRONG = {
+    "number": 5,
+    "pair": [1, 2],
+    "ragged": [[1], [1, 2]],
+    "word": "x",
+    "nothing": None,
+    "table": {"a": 1},
+    "words": [[["x"]]],
+    "deep": [[[1.0]]],
+    "large": 1e308,
+    "empty": [],
+    "surrogate": "\udc80",
+    "complex": {"real": [1], "imag": ["x"]},
+    "tables": [{"a": 1}],
+}
+
+
+@pytest.mark.parametrize(
+    "kind", ["trajectory", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in OTHERS)]
+)
+def test_any_value_in_the_place_of_any_entry_is_refused_or_accepted(kind, tmp_path):
+    path = tmp_path / "file.json"
+    robot = fflin.load("astrobee_arm")
+    thing = made("motion").trajectory(robot) if kind == "trajectory" else made(kind)
+    thing.save(path)
+    record, _ = read_record(path)
+    wrong = []
+    for key, kept in record.items():
+        for name, value in WRONG.items():
+            several = isinstance(kept, list) and len(kept) > 1
+            for placed in [value, [*kept[:-1], value]] if several else [value]:
+                path.write_text(json.dumps(record | {key: placed}))
+                try:
+                    if kind == "trajectory":
+                        fflin.Trajectory.load(path, robot)
+                    else:
+                        str(type(thing).load(path))
+                except fflin.FflinError:
+                    pass
+                except Exception as error:
+                    wrong.append((key, name, placed is value, repr(error)))
+    assert not wrong
+
+
+def test_a_gain_whose_entries_contradict_each_other_is_refused(tmp_path):
+    made("gain").save(tmp_path / "gain.json")
+    record, _ = read_record(tmp_path / "gain.json")
+    for change in (
+        {"regulated": ["nosuch"]},
+        {"state_names": [*record["state_names"][:-1], "x"], "regulated": record["state_names"]},
+        {"poles": []},
+    ):
+        (tmp_path / "gain.json").write_text(json.dumps(record | change))
+        with pytest.raises(fflin.FileError):
+            fflin.Gain.load(tmp_path / "gain.json")
+
+
+def test_files_are_not_unpacked_if_they_would_fill_the_memory(monkeypatch, tmp_path):
+    from scipy.io import savemat
+
+    zeros = np.zeros((400, 500))  # 1.6 MB, of which a file has some kB
+    np.savez_compressed(tmp_path / "bomb.npz", D=zeros)
+    savemat(tmp_path / "bomb.mat", {"D": zeros}, do_compression=True)
+    lin = made("model")
+    room = 2 * zeros.nbytes
+    for name in ("bomb.npz", "bomb.mat"):
+        assert (tmp_path / name).stat().st_size < 10_000
+        for memory, said in ((room, "not fit into memory"), (room + 10_000, "500 inputs")):
+            monkeypatch.setattr("fflin.base.record.memory", lambda memory=memory: memory)
+            with pytest.raises(fflin.FflinError, match=said):
+                fflin.LinearController(tmp_path / name, lin)
+
+
+def test_the_largest_mat_files_are_read_without_decompressing_them_whole(monkeypatch, tmp_path):
+    from scipy.io import savemat
+
+    from fflin.base.record import _unpacked_size
+
+    savemat(tmp_path / "a.mat", {"D": np.zeros(10**6), "E": np.ones(3)}, do_compression=True)
+    content = (tmp_path / "a.mat").read_bytes()
+    assert 8e6 < _unpacked_size(content) < 8.1e6
+    monkeypatch.setattr("fflin.base.record.memory", lambda: 100)
+    assert _unpacked_size(content) < 8e6

@@ -68,6 +68,7 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
         ('q_b = {distribution = "triang"}', 3, "'c'"),
         ('q_b = {distribution = "norm", d = 1}', 3, "'d'"),
         ('q_b = {distribution = "triang", c = 7}', 3, "c = 7"),
+        ('q_b = {distribution = "ksone", n = 100000}', 3, "at most 1000"),
         ('q_b = {distribution = "norm", scale = "a"}', 3, "norm"),
         ('q_b = {distribution = "norm", scale = inf}', 3, "finite"),
         ('q_b = {distribution = "triang", c = [[0.5]]}', 3, "finite"),

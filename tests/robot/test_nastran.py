@@ -1,10 +1,14 @@
 """Craig-Bampton superelements from files, which are written here by pyYeti."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import fflin
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import FflinWarning, FileError, InputError
+from fflin.base.writing import files_of_command
 
 with np.printoptions():  # which pyYeti changes
     nastran = pytest.importorskip("pyyeti.nastran")
@@ -143,10 +147,12 @@ def test_what_is_no_superelement_is_refused(files, tmp_path):
     empty = tmp_path / "empty.op4"
     empty.write_bytes(b"")
     for wrong in (
-        (cut, asm), (empty, asm), (asm, asm), (op4, text), (op4, op4), (op4, tmp_path / "none.asm"),
+        (cut, asm), (empty, asm), (asm, asm), (op4, text), (op4, op4),
     ):  # fmt: skip
         with pytest.raises(InputError):
             read(*wrong, frame="base")
+    with pytest.raises(FileError, match="No such file"):
+        read(op4, tmp_path / "none.asm", frame="base")
 
 
 def test_matrices_of_another_kind_are_refused(files, tmp_path):
@@ -174,3 +180,56 @@ def test_matrices_of_another_kind_are_refused(files, tmp_path):
     nastran.op4.write(str(path), {"kgg": K, "maa": M})
     with pytest.raises(InputError, match="no stiffness matrix"):
         fflin.FlexibleAppendage.from_nastran(path, asm, frame="base")
+
+
+def test_included_files_and_the_punch_file_are_inputs(files, tmp_path):
+    op4, asm, _ = files
+    lines = asm.read_text().splitlines(keepends=True)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "rest.inc").write_text("".join(lines[2:]))
+    split = tmp_path / "split.asm"
+    split.write_text("".join(lines[:2]) + "INCLUDE 'sub/\nrest.inc' $ the others\n")
+    split.with_suffix(".pch").write_bytes(asm.with_suffix(".pch").read_bytes())
+    read = fflin.FlexibleAppendage.from_nastran
+    whole, parts = (read(op4, path, frame="base") for path in (asm, split))
+    assert (whole.frequency == parts.frequency).all()
+    assert (whole.participation == parts.participation).all()
+    link = tmp_path / "link.json"
+    for target in (tmp_path / "sub" / "rest.inc", split.with_suffix(".pch"), split, op4):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        with files_of_command([], [link]), pytest.raises(FileError, match="is the input file"):
+            read(op4, split, frame="base")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
+def test_pipes_devices_and_endless_lists_are_refused_at_once(files, tmp_path):
+    op4, asm, _ = files
+    read = fflin.FlexibleAppendage.from_nastran
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    text = asm.read_text()
+    wrong = tmp_path / "wrong.asm"
+    for path in (pipe, Path("/dev/zero")):
+        with pytest.raises(FileError, match="not a regular file"):
+            read(path, asm, frame="base")
+        with pytest.raises(FileError, match="not a regular file"):
+            read(op4, path, frame="base")
+        wrong.write_text(f"{text}include '{path}'\n")
+        with pytest.raises(FileError, match="not a regular file"):
+            read(op4, wrong, frame="base")
+    wrong.write_text(f"{text}include 'wrong.asm'\n")
+    with pytest.raises(InputError, match="includes itself"):
+        read(op4, wrong, frame="base")
+    for points in (
+        "SPOINT 1001 THRU99999999",
+        "SPOINT,1001,THRU,99999999",
+        "spoint  1001    thru    +A1\n+A1     99999999",
+    ):
+        wrong.write_text(f"{text}{points}\n")
+        with pytest.raises(InputError, match=r"99,99\d,\d{3} points"):
+            read(op4, wrong, frame="base")
+    asm.with_suffix(".pch").unlink()
+    asm.with_suffix(".pch").symlink_to(pipe)
+    with pytest.raises(FileError, match="not a regular file"):
+        read(op4, asm, frame="base")

@@ -30,25 +30,54 @@ ODD = {
     "type": dict,
     "bytes": b"\x00",
     "pose": pin.SE3(2.0 * np.eye(3), np.zeros(3)),
+    "five": 5,
+    "true": True,
+    "trillion": 10**12,
+    "largest": 1e308,
+    "surrogate": "\udc80",
+    "surrogates": ["\udc80"],
+    "null": "a\0b",
+    "return": "a\rb ",
+    "long": "x" * 5000,
+    "array": np.zeros(3),
+    "large array": np.full(3, 1e308),
+    "large matrix": np.full((3, 3), 1e308),
+    "no entries": np.zeros(0),
+    "text array": np.array(["a"]),
+    "date": np.datetime64("2020"),
+    "set": {1.0},
+    "nested": {"q_b": {"x": [1]}},
+    "nothing": [None],
+    "pair": (1, 2),
+    "device": "/dev/zero",
+    "thing": object(),
 }
 
 
-def sound(folder):
-    """What each public function takes, by the names of its arguments: a call that works."""
+def _objects():
+    """Robot, models and designs that the calls take."""
     robot = fflin.load("planar_detumble")
-    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(6 + robot.n)
     lin = fflin.linearize(robot)
-    given = lin.to("mujoco")
     gain = fflin.lqr(lin, 1.0, 1.0)
     filtered = fflin.kalman(lin, 1.0, 1.0)
-    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
     t = np.array([0.0, 0.01, 0.02])
-    rows = [np.tile(row, (3, 1)) for row in (q, v, u)]
-    along = fflin.linearize_trajectory(robot, t, *rows)
-    schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    rows = {
+        "q": np.tile(robot.neutral(), (3, 1)),
+        "v": np.zeros((3, robot.nv)),
+        "u": np.zeros((3, 6 + robot.n)),
+    }
+    along = fflin.linearize_trajectory(robot, t, **rows)
+    return robot, lin, gain, filtered, {"t": t} | rows, along
+
+
+def light(folder):
+    """Calls that need no compiled code and no second, by the names of the functions."""
+    robot, lin, gain, filtered, knots, along = _objects()
+    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(6 + robot.n)
+    given = lin.to("mujoco")
+    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
     sensitive = fflin.sensitivity(lin)
     uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
-    batch = fflin.sweep(robot, [q, q])
     found = {"robot": robot, "q": q, "v": v, "u": u}
     place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
     weights = {"Q": 1.0, "R": 1.0}
@@ -56,7 +85,6 @@ def sound(folder):
     vector = (0.0, 0.0, 1.0)
     joint = robot.joint_names[0]
     return {
-        "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0},
         "Accelerometer": {"frame": "base"},
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
         "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0)},
@@ -73,7 +101,6 @@ def sound(folder):
             **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
             "body_radius": None,
         },
-        "check": {"robot": robot, "lin": lin, "tolerance": 1e-6},
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
         "effort": {"robot": robot, "values": {}},
@@ -93,7 +120,7 @@ def sound(folder):
         "JointVelocities": {"joints": (joint,)},
         "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
         "linearize": found | place,
-        "linearize_trajectory": dict(zip("tqvu", (t, *rows), strict=True))
+        "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
         "Linearizer": {"robot": robot} | place,
         "list_robots": {},
@@ -108,15 +135,7 @@ def sound(folder):
         "line_up": {"gain": gain, "lin": lin},
         "lqg": {"gain": gain, "estimator": filtered},
         "lqr": {"lin": lin} | weights | {"N": None},
-        "lqr_batch": {"batch": batch} | weights,
-        "modes": {"lin": lin},
-        "effective_masses": {"lin": lin},
-        "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
-        "mpc": {
-            **{"lin": lin, "Q": 1.0, "R": 1.0, "horizon": 2, "dt": 0.1, "limits": {"tau_b": 1.0}},
-            **{"Qf": "steady", "weights": None},
-        },
         "from_tool": {
             **{"robot": robot, "tool": "mujoco", "q": given.q, "v": given.v, "u": given.u0},
             **{"A": given.A, "B": given.B, "dt": None, "frame": "hybrid"},
@@ -126,34 +145,12 @@ def sound(folder):
         "LinearModel.to": {"self": lin, "tool": "euler", "dt": None},
         "ToolModel.load": {"path": "nosuch.npz"},
         "ToolModel.save": {"self": given, "path": folder / "d.npz"},
-        "funnel": {
-            **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
-            **{"knots": 1, "samples": 1, "seed": 0, "confidence": 0.9, "dt": 0.01, "engine": None},
-            **dict.fromkeys(("executor", "workers", "threads", "progress", "limits", "sample")),
-        },
         "plot_funnel": {"funnel": None, "path": None},
-        "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
-        "monte_carlo": {
-            **{"robot": robot, "policy": None, "dispersions": {"q_b": 0.01}, "runs": 2, "seed": 0},
-            **{"duration": 0.02, "until": None, "width": 0.1, "confidence": 0.9, "threads": 1},
-            **{"executor": None, "chunk": None, "progress": None, "out": None, "engine": None},
-            **{"goals": (), "histories": 0},
-        },
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
         "outputs": {"lin": lin} | found,
-        "plan": {
-            **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
-            **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},
-        },
-        "plot_campaign": {
-            "campaign": fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=0.02),
-            **{"path": None, "worst": 1},
-        },
-        "plot_check": {"check": fflin.check(robot, lin), "path": None},
         "plot_loops": {"gain": gain, "path": None},
         "plot_matrices": {"lin": lin, "path": None},
-        "plot_modes": {"modes": fflin.modes(filtered_model), "path": None},
         "plot_motion": {"motion": motion, "path": None, "show": None},
         "plot_poles": {"poles": gain, "path": None, "dt": 0.0, "title": "x"},
         "plot_validity": {"validity": None, "path": None},
@@ -175,7 +172,6 @@ def sound(folder):
             "max_speed": 10.0,
         },
         "sampled_cost": {"lin": lin, "dt": 0.1} | weights,
-        "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
         "sensitivity": {"lin": lin},
         "simulate": {
             **{"robot": robot, "policy": None, "q0": q, "v0": v, "duration": 0.02, "dt": 0.01},
@@ -194,47 +190,19 @@ def sound(folder):
         },
         "StateFeedback": {"lin": lin, "K": gain.K},
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
-        "sweep": found
-        | {"q": [q]}
-        | place
-        | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
             **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
             "torque": 0.02,
         },
-        "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
-        | {"robot": robot, "hold": None, "frame": "local"},
-        "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
-        "TrajectoryOutputFeedback": {
-            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, P0=1.0, sample=0.01)},
-            **{"schedule": fflin.tvlqr(along, 1.0, 1.0, 1.0, 0.01), "noise": None},
-        },
-        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": 0.01},
-        "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
+        "Trajectory": knots | {"robot": robot, "hold": None, "frame": "local"},
         "uncertain": {"robot": robot, "ranges": {"base.mass": 0.1, "link_1.com.x": (0.1, 0.2)}},
-        "validity": {
-            **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
-            **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
-            **{"limits": None, "workers": None, "threads": 1, "engine": None},
-        },
         "velocity": {"robot": robot, "values": {}},
-        "CLaw": {"folder": fflin.write_c(gain, folder / "c_code"), "compiler": "cc"},
-        "write_c": {
-            **{"law": gain, "folder": folder / "c_code_2", "robot": robot, "limits": "urdf"},
-            **{"name": "controller", "real": "double"},
-        },
-        "visualize": {
-            **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
-            **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space"},
-        },
         "Sensitivity.along": {"self": sensitive, "direction": {"base.mass": 1.0}},
         "Sensitivity.check": {"self": sensitive, "names": ["base.mass"]},
         "Sensitivity.poles": {"self": sensitive, "gain": gain.K},
         "Uncertain.at": {"self": uncertain, "values": {"base.mass": 100.0}},
-        "Uncertain.lft": {"self": uncertain, "q": q},
         "Uncertain.samples": {"self": uncertain, "n": 1, "seed": 0},
-        "LFT.at": {"self": uncertain.lft(), "values": {"base.mass": 100.0}},
         "LFT.load": {"path": "nosuch.npz"},
         "LinearTrajectory.discretize": {"self": along, "dt": 0.01},
         "LinearTrajectory.load": {"path": "nosuch.npz", "robot": robot},
@@ -257,4 +225,130 @@ def sound(folder):
         },
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},
+        "CircularOrbit.from_json": {"text": "{}"},
+        "Compensator.load": {"path": "nosuch.npz"},
+        "Estimator.load": {"path": "nosuch.npz"},
+        "FilterSchedule.load": {"path": "nosuch.npz"},
+        "Funnel.load": {"path": "nosuch.npz", "robot": robot},
+        "Gain.load": {"path": "nosuch.npz"},
+        "Gain.save": {"self": gain, "path": folder / "gain.json"},
+        "Gain.to": {"self": gain, "tool": "mujoco"},
+        "GainBatch.load": {"path": "nosuch.npz"},
+        "GainSchedule.load": {"path": "nosuch.npz"},
+        "Campaign.load": {"path": "nosuch.npz"},
+        "LinearBatch.load": {"path": "nosuch.npz", "robot": robot, "verify": True},
+        "LinearTrajectory.check": {"self": along, "tolerance": 1e-3},
+        "LinearTrajectory.save": {"self": along, "path": folder / "along.npz"},
+        "Motion.load": {"path": "nosuch.npz"},
+        "Motion.plot": {"self": motion, "path": None, "show": None},
+        "Motion.trajectory": {"self": motion, "robot": robot},
+        "Robot.checked_configuration": {"self": robot, "q": q},
+        "Robot.checked_velocity": {"self": robot, "v": v},
+        "Robot.joint": {"self": robot, "name": joint},
+        "Sensitivity.save": {"self": sensitive, "path": folder / "sensitivity.npz"},
+        "Sensitivity.table": {"self": sensitive, "top": 3, "only": None},
+        "Slosh.cylinder": {
+            **{"frame": "base", "radius": 0.1, "height": 0.2, "density": 1e3, "acceleration": 1.0},
+            **{"bottom": vector, "axis": vector, "pendulum": True, "damping": 0.0, "name": "t"},
+        },
+        "ToolGain.load": {"path": "nosuch.npz"},
+    }
+
+
+def sound(folder):
+    """What each public function takes, by the names of its arguments: a call that works."""
+    robot, lin, gain, _, _, along = _objects()
+    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(6 + robot.n)
+    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
+    schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
+    batch = fflin.sweep(robot, [q, q])
+    campaign = fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=0.02)
+    found = {"robot": robot, "q": q, "v": v, "u": u}
+    place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
+    weights = {"Q": 1.0, "R": 1.0}
+    filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
+    return light(folder) | {
+        "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0},
+        "check": {"robot": robot, "lin": lin, "tolerance": 1e-6},
+        "lqr_batch": {"batch": batch} | weights,
+        "modes": {"lin": lin},
+        "effective_masses": {"lin": lin},
+        "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
+        "mpc": {
+            **{"lin": lin, "Q": 1.0, "R": 1.0, "horizon": 2, "dt": 0.1, "limits": {"tau_b": 1.0}},
+            **{"Qf": "steady", "weights": None},
+        },
+        "funnel": {
+            **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
+            **{"knots": 1, "samples": 1, "seed": 0, "confidence": 0.9, "dt": 0.01, "engine": None},
+            **dict.fromkeys(("executor", "workers", "threads", "progress", "limits", "sample")),
+        },
+        "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
+        "monte_carlo": {
+            **{"robot": robot, "policy": None, "dispersions": {"q_b": 0.01}, "runs": 2, "seed": 0},
+            **{"duration": 0.02, "until": None, "width": 0.1, "confidence": 0.9, "threads": 1},
+            **{"executor": None, "chunk": None, "progress": None, "out": None, "engine": None},
+            **{"goals": (), "histories": 0},
+        },
+        "plan": {
+            **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
+            **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},
+        },
+        "plot_campaign": {
+            "campaign": campaign,
+            **{"path": None, "worst": 1},
+        },
+        "plot_check": {"check": fflin.check(robot, lin), "path": None},
+        "plot_modes": {"modes": fflin.modes(filtered_model), "path": None},
+        "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
+        "sweep": found
+        | {"q": [q]}
+        | place
+        | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),
+        "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
+        "TrajectoryOutputFeedback": {
+            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, P0=1.0, sample=0.01)},
+            **{"schedule": fflin.tvlqr(along, 1.0, 1.0, 1.0, 0.01), "noise": None},
+        },
+        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": 0.01},
+        "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
+        "validity": {
+            **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
+            **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
+            **{"limits": None, "workers": None, "threads": 1, "engine": None},
+        },
+        "CLaw": {"folder": fflin.write_c(gain, folder / "c_code"), "compiler": "cc"},
+        "write_c": {
+            **{"law": gain, "folder": folder / "c_code_2", "robot": robot, "limits": "urdf"},
+            **{"name": "controller", "real": "double"},
+        },
+        "visualize": {
+            **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
+            **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space"},
+        },
+        "Uncertain.lft": {"self": uncertain, "q": q},
+        "LFT.at": {"self": uncertain.lft(), "values": {"base.mass": 100.0}},
+        "Campaign.fraction": {"self": campaign, "condition": "settled", "confidence": 0.9},
+        "Campaign.mean": {"self": campaign, "name": "attitude", "confidence": 0.9},
+        "Campaign.met": {"self": campaign, "condition": "settled"},
+        "Campaign.quantile": {"self": campaign, "name": "attitude", "p": 0.5, "confidence": 0.9},
+        "Campaign.replay": {"self": campaign, "run": 0},
+        "Campaign.save": {"self": campaign, "path": folder / "campaign.npz"},
+        "Campaign.sensitivity": {"self": campaign, "name": None},
+        "Campaign.values": {"self": campaign, "name": "attitude"},
+        "Campaign.worst": {"self": campaign, "k": 1},
+        "GainSchedule.cost_to_go": {"self": schedule, "t": 0.0},
+        "GainSchedule.gain": {"self": schedule, "t": 0.0},
+        "GainSchedule.trajectory": {"self": schedule, "robot": robot},
+        "LinearBatch.nearest": {"self": batch, "joints": {"joint_1": 0.0}},
+        "LinearBatch.save": {"self": batch, "path": folder / "batch.npz"},
+        "LinearBatch.select": {"self": batch, "joints": {"joint_1": 0.0}},
+        "Uncertain.worst": {
+            **{"self": uncertain, "gain": gain.K, "q": q, "samples": 1, "seed": 0},
+        },
+        "FlexibleAppendage.from_nastran": {
+            **{"op4": "nosuch.op4", "asm": "nosuch.asm", "frame": "base", "origin": None},
+            **{"modes": None, "length": "m", "mass": "kg", "damping": 0.01, "name": None},
+        },
     }

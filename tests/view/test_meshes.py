@@ -106,3 +106,54 @@ def test_welding_keeps_a_mesh_within_its_grid():
     assert area(mesh.vertices.astype(float), mesh.faces) == pytest.approx(
         area(vertices, faces), rel=0.03
     )
+
+
+NODES = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset/><library_nodes>{}</library_nodes></COLLADA>"""
+
+
+@pytest.mark.parametrize(
+    ("nodes", "said"),
+    [
+        ('<node id="a"><instance_node url="#a"/></node>', "contains itself"),
+        (
+            '<node id="a"><node id="b"><instance_node url="#c"/></node></node>'
+            '<node id="c"><instance_node url="#a"/></node>',
+            "contains itself",
+        ),
+        (
+            "".join(
+                f'<node id="n{k}">' + 2 * f'<instance_node url="#n{k + 1}"/>' + "</node>"
+                for k in range(40)
+            ),
+            "nodes",
+        ),
+    ],
+)
+def test_nodes_that_would_be_drawn_without_end_are_refused(nodes, said, tmp_path):
+    path = tmp_path / "a.dae"
+    path.write_text(NODES.format(nodes))
+    with pytest.raises(ValueError, match=said):
+        load_mesh(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
+def test_meshes_do_not_wait_for_pipes(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text(f"mtllib pipe\n{triangle}")
+    buffers = '{"asset": {"version": "2.0"}, "buffers": [{"uri": "pip%65", "byteLength": 9}]}'
+    (tmp_path / "a.gltf").write_text(buffers)
+    for name in ("a.obj", "a.gltf"):
+        with pytest.raises(ValueError, match="not a regular file"):
+            load_mesh(tmp_path / name)
+    (tmp_path / "b.obj").write_text(f"mtllib nosuch.mtl\n{triangle}")
+    assert len(load_mesh(tmp_path / "b.obj")[0].faces) == 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_mesh_of_an_impossible_unit_is_refused(tmp_path):
+    path = tmp_path / "a.dae"
+    path.write_text(COLLADA.replace('name="centimeter" meter="0.01"', 'meter="1e300"'))
+    with pytest.raises(ValueError, match="check its unit"):
+        load_mesh(path)

@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, as_double, number, positive, shaped
+from fflin.base.validation import Array, FrozenArrays, as_double, number, quantity, shaped, truth
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
 # First positive root x of J_1'(x) = 0, where J_1 is a Bessel function. The first lateral sloshing
@@ -178,9 +178,11 @@ class FlexibleAppendage(FrozenArrays):
 
         Raises
         ------
+        FileError
+            If a file, or a file that it includes, is missing, too large or not a regular file.
         InputError
-            If a file is missing, truncated or not a Craig-Bampton model, or pyYeti is not
-            installed (``pip install 'fflin[nastran]'``).
+            If a file is truncated or not a Craig-Bampton model, or pyYeti is not installed (``pip
+            install 'fflin[nastran]'``).
         UnknownNameError
             If a unit is unknown.
         """
@@ -295,7 +297,7 @@ class Slosh:
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
-                object.__setattr__(self, name, positive(f"{name} of {what}", value, unit))
+                object.__setattr__(self, name, quantity(f"{name} of {what}", value, unit))
         if self.frequency is None and self.length is None:
             raise InputError(
                 f"{what} has neither a frequency nor a length; give the frequency [Hz] of a mass "
@@ -377,7 +379,7 @@ class Slosh:
         """
         sizes = {"radius": radius, "height": height, "density": density}
         for what, value in (sizes | {"acceleration": acceleration}).items():
-            positive(f"{what} of the tank", value)
+            quantity(f"{what} of the tank", value)
         k = _FIRST_ROOT / radius
         along = unit_vector("axis of the tank", axis)
         liquid = density * math.pi * radius**2 * height
@@ -386,7 +388,7 @@ class Slosh:
         at = height - 2.0 / k * math.tanh(0.5 * k * height)
         center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
         position, frequency = tuple(center.tolist()), omega / (2.0 * math.pi)
-        length = acceleration / omega**2 if pendulum else None
+        length = acceleration / omega**2 if truth("pendulum", pendulum) else None
         return cls(frame, share * liquid, position, frequency, length, along, damping, name)
 
     @property

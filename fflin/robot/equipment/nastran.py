@@ -1,15 +1,18 @@
 """Reader of Nastran's Craig-Bampton superelements, whose modes are clamped at an interface."""
 
+import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, require_known
+from fflin.base.errors import FflinError, InputError, require_known
 from fflin.base.validation import Array, Mask, vector, whole
-from fflin.base.writing import as_path, reason, remember
+from fflin.base.writing import as_path, read_file, reason, require_regular
 
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}  # [m]
 MASSES = {
@@ -22,6 +25,17 @@ MASSES = {
 }  # [kg]
 # Names of the mass matrix and of the stiffness matrix in the files of different programs.
 _MASS, _STIFFNESS = ("mxx", "maa", "maax"), ("kxx", "kaa", "kaax")
+
+# Largest sizes of the files [bytes], the largest number of files that an .asm file includes, and
+# the largest number of points in its lists "1001 THRU 1020". They are checked before pyYeti reads
+# the files, because pyYeti takes memory for every point.
+_LARGEST_OP4, _LARGEST_TEXT = 2**31, 2**26
+_MOST_FILES, _MOST_POINTS = 100, 10_000
+
+# An INCLUDE statement. Its path may continue on the next lines.
+_INCLUDE = re.compile(r"^include[^'\n]*'([^']*)'.*$", re.IGNORECASE | re.MULTILINE)
+# Words of a list of points; a continuation such as "+A1" is one word.
+_WORD = re.compile(r"[+*]\w*|\d+|thru", re.IGNORECASE)
 
 # Tolerance for rounding errors, relative to the largest entry of the matrix. It applies to the
 # asymmetry of the mass and stiffness matrices, and to the stiffness that couples the boundary to
@@ -48,7 +62,7 @@ def read_superelement(
     require_known("unit of length", [str(length)], LENGTHS)
     require_known("unit of mass", [str(mass)], MASSES)
     path, assembly = as_path(op4), as_path(asm)
-    remember(path, assembly)
+    require_regular(path, ".op4", _LARGEST_OP4)
     boundary, rigid, points = _boundary(assembly)
     M, K = _matrices(path, len(boundary))
     inner, rigid = ~boundary, rigid[boundary]
@@ -95,6 +109,8 @@ def read_superelement(
 def _read_as(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
+    except FflinError:
+        raise
     except ImportError:
         raise InputError("Nastran files need pyYeti: pip install 'fflin[nastran]'") from None
     except Exception as error:  # pyYeti may raise any error
@@ -108,13 +124,22 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     columns of the rigid motions (m, 6) are unit translations and rotations about the basic origin.
     The positions (grids, 3) are in basic coordinates, in the file's unit of length.
     """
-    punched = path.suffix == ".asm" and path.with_suffix(".pch").is_file() and "pv_only"
-    with _read_as(path, "the assembly file (.asm) of an external superelement"):
+    # A .pch file lists the degrees of freedom that each grid point retains. Without this file,
+    # each grid point retains all six.
+    punch = path.with_suffix(".pch")
+    punched = path.suffix == ".asm" and punch.exists() and "pv_only"
+    with (
+        _read_as(path, "the assembly file (.asm) of an external superelement"),
+        TemporaryDirectory(prefix="fflin-") as folder,
+    ):
         with np.printoptions():  # importing pyYeti changes these options
             from pyyeti import nastran
-        # A .pch file lists the degrees of freedom that each grid point retains. Without this file,
-        # each grid point retains all six.
-        uset, _, found, *kept = nastran.asm2uset(str(path), try_rdextrn=punched)
+        # pyYeti reads copies, which include no other files.
+        copy = Path(folder, "a.asm")
+        copy.write_text(_complete(path), "utf-8")
+        if punched:
+            copy.with_suffix(".pch").write_text(_complete(punch), "utf-8")
+        uset, _, found, *kept = nastran.asm2uset(str(copy), try_rdextrn=punched)
         rigid = np.asarray(nastran.rbgeom_uset(uset))
         points = uset.loc[(slice(None), 1), "x":"z"].values.astype(float)
     keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
@@ -125,6 +150,47 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
             "both, as in a Craig-Bampton superelement"
         )
     return boundary[keep], rigid[keep], points
+
+
+def _complete(path: Path) -> str:
+    """Return the text of a Nastran file, in which included files replace INCLUDE statements.
+
+    Raise `InputError` if the text has too many files, characters or points.
+    """
+    read = list[Path]()
+    size = 0
+
+    def text_of(file: Path) -> str:
+        nonlocal size
+        read.append(file)
+        if len(read) > _MOST_FILES:
+            raise InputError(f"{path} includes more than {_MOST_FILES} files, or includes itself")
+        content = read_file(file, "Nastran", _LARGEST_TEXT - size)
+        size += len(content)
+        return _INCLUDE.sub(lambda found: text_of(included(file, found[1])), content.decode())
+
+    def included(file: Path, written: str) -> Path:
+        # A bare file name is relative to the file that includes it, any other path to the first.
+        name = "".join(line.strip() for line in written.splitlines())
+        folder = path.parent if os.path.dirname(name) else file.parent
+        return folder / name
+
+    text = text_of(path)
+    if (points := _listed_points(text)) > _MOST_POINTS:
+        raise InputError(
+            f"{path} lists {points:,} points with THRU, expected at most {_MOST_POINTS:,}"
+        )
+    return text
+
+
+def _listed_points(text: str) -> int:
+    """Return the number of points in all lists such as ``1001 THRU 1020``."""
+    words = [word for word in _WORD.findall(text) if word[0] not in "+*"]
+    points = 0
+    for first, between, last in zip(words, words[1:], words[2:], strict=False):
+        if between.lower() == "thru" and first.isdigit() and last.isdigit():
+            points += abs(int(last) - int(first)) + 1
+    return points
 
 
 def _matrices(path: Path, size: int) -> list[Array]:
