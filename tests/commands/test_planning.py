@@ -28,6 +28,38 @@ def test_a_plan_is_followed(tmp_path):
     assert "--duration" in refused("plan", ROBOT)
 
 
+WHEELS = """
+[[input]]
+type = "reaction_wheel"
+axis = [1, 0, 0]
+inertia = 2e-4
+[[input]]
+type = "reaction_wheel"
+axis = [0, 1, 0]
+inertia = 2e-4
+[[input]]
+type = "reaction_wheel"
+axis = [0, 0, 1]
+inertia = 2e-4
+"""
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("degrees", [1.0, 30.0])
+def test_wheels_alone_slew_a_body_at_rest(tmp_path, degrees):
+    (tmp_path / "wheels.toml").write_text(WHEELS)
+    command = ["plan", "cubesat", "--inputs", "wheels.toml", "--target-rpy", degrees, 0, 0]
+    for name in ("r_b", "v_b", "omega_b"):
+        command += ["--free-end", name]
+    code, _, err = run(*command, "--duration", 60, "-o", "p.npz", cwd=tmp_path)
+    assert code == 0, err
+    robot = fflin.load("cubesat", inputs=[fflin.ReactionWheel(a, inertia=2e-4) for a in np.eye(3)])
+    motion = fflin.Trajectory.load(tmp_path / "p.npz", robot)
+    roll = 2.0 * np.arctan2(motion.q[-1, 3], motion.q[-1, 6])
+    assert np.degrees(roll) == pytest.approx(degrees, abs=1e-6)
+    assert np.abs(motion.v[-1]).max() < 1e-9
+
+
 def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     spring = ("--stiffness", "joint_1=3", "--joint", "joint_1=0.2")
     code, out, _ = run("equilibrium", ROBOT, *spring, "-o", "e.json", cwd=tmp_path)

@@ -307,6 +307,70 @@ def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
         fflin.plan(robot, (goal, None), 30.0, v0=v, knots=31, free=["r_b", "v_b"])
 
 
+CUBE_AXES = np.eye(3)
+PYRAMID_AXES = np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [1.0, -1.0, 1.0]])
+FREE_OF_WHEELS = ["r_b", "v_b", "omega_b"]
+
+
+def with_wheels(axes, inertia=2e-4, **options):
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    wheels = [fflin.ReactionWheel(axis, inertia=inertia, **options) for axis in axes]
+    return fflin.load("cubesat", inputs=wheels), axes
+
+
+@pytest.mark.parametrize(
+    ("axes", "degrees"),
+    [(CUBE_AXES, 1.0), (PYRAMID_AXES, 30.0), *exhaustive((CUBE_AXES, 30.0), (PYRAMID_AXES, 1.0))],
+)
+def test_a_slew_from_rest_with_wheels_alone_has_the_closed_form(axes, degrees):
+    """About a principal axis, the motion is that of a double integrator. Its torque is that of the
+    wheels, distributed with the least norm. The inertia of the rotors about their axes is not
+    accelerated by the torque."""
+    robot, axes = with_wheels(axes)
+    angle = np.radians(degrees)
+    goal = turned(robot, angle)
+    count, T = 20, 60.0
+    motion = fflin.plan(robot, (goal, None), T, knots=count + 1, free=FREE_OF_WHEELS)
+    J = fflin.linearize(robot).M[2, 2] - 2e-4 * np.square(axes[:, 2]).sum()
+    k = np.arange(count)
+    h = T / count
+    torque = 6.0 * J * angle * (count - 1 - 2 * k) / (h**2 * count * (count**2 - 1))
+    exact = -np.outer(torque, np.linalg.pinv(axes.T)[:, 2])
+    assert motion.u[:-1] == pytest.approx(exact, abs=1e-6 * np.abs(exact).max())
+    assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:6]).max() < 1e-8
+    assert np.abs(motion.v[-1]).max() < 1e-9 and motion.residual.max() < 1e-8
+
+
+@pytest.mark.parametrize("axes", [CUBE_AXES, *exhaustive(PYRAMID_AXES)])
+def test_wheels_alone_slew_about_any_axis_within_limits(axes):
+    """From rest to rest, the momentum of the body and its wheels stays zero."""
+    robot, _ = with_wheels(axes, max=2.2e-5)
+    base = pin.SE3(pin.rpy.rpyToMatrix(*np.radians((30.0, 20.0, -40.0))), np.zeros(3))
+    goal = fflin.configuration(robot, base=base)
+    motion = fflin.plan(robot, (goal, None), 40.0, knots=21, free=FREE_OF_WHEELS)
+    assert np.abs(motion.u).max() == pytest.approx(2.2e-5, rel=1e-9)
+    assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:6]).max() < 1e-7
+    assert np.abs(motion.v[-1]).max() < 1e-7 and motion.residual.max() < 1e-7
+    data = robot.model.createData()
+    stored = 2e-4 * np.abs(motion.v[:, 6:]).max()
+    for q, v in zip(motion.q, motion.v, strict=True):
+        pin.computeCentroidalMomentum(robot.model, data, q, v)
+        assert np.abs(data.hg.angular).max() <= 1e-6 * stored
+
+
+@pytest.mark.exhaustive
+def test_a_regulator_tracks_a_plan_of_wheels_alone():
+    """From an initial error of 1.7 deg, the tracked motion ends at the goal."""
+    robot, _ = with_wheels(CUBE_AXES)
+    base = pin.SE3(pin.rpy.rpyToMatrix(*np.radians((30.0, 20.0, -40.0))), np.zeros(3))
+    goal = fflin.configuration(robot, base=base)
+    motion = fflin.plan(robot, (goal, None), 60.0, knots=21, free=FREE_OF_WHEELS)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=0.5)
+    q0 = turned(robot, 0.03, (1.0, 0.0, 0.0))
+    flown = fflin.simulate(robot, schedule, q0=q0, duration=60.0)
+    assert flown.attitude_error[0] > 1.0 and flown.attitude_error[-1] < 0.01
+
+
 def test_starts_and_goals_are_given_in_every_form():
     robot = fflin.load("astrobee_arm", start={"joints": {"arm_proximal": 0.2}})
     q = fflin.configuration(robot, {"arm_proximal": -0.3})

@@ -201,4 +201,8 @@ class Shooting:
         wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
         by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
         rates = self.state.velocities(wanted)[..., None]
+        # The wheels accelerate as needed. Wheels are light, so with their rows, the least-squares
+        # problem would be about standing wheels instead of the motion of the base and the joints.
+        kept = np.delete(np.arange(self.state.nx // 2), self.wheels)
+        by_u, rates = by_u[:, kept], rates[:, kept]
         return q, v, (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
