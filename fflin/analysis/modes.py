@@ -52,8 +52,8 @@ class Mode(FrozenArrays):
     energy : mapping of str to float
         Fraction of the mode's kinetic energy in each body, the largest first. The fractions are
         nonnegative and sum to 1. A body has the name of its link (of several links, the first), or
-        of its joint if it has no link; the root body is "base". A body includes its flexible appendages and sloshing liquid. The mapping is empty if
-        the model was loaded from a file.
+        of its joint if it has no link; the root body is "base". A body includes its flexible
+        appendages and sloshing liquid. The mapping is empty if the model was loaded from a file.
 
     Notes
     -----

@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import re
 import warnings
 import zlib
@@ -260,7 +261,10 @@ def _of_mat(value: object) -> object:
 
     Text becomes a str, cells or text rows a list, a struct a dict, and a sparse matrix an array.
     """
-    if hasattr(value, "toarray"):
+    import scipy.sparse as sp
+
+    if sp.issparse(value):
+        _require_room(8 * math.prod(value.shape))
         return value.toarray()
     if not isinstance(value, np.ndarray):
         return value

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, listed
-from fflin.base.validation import instance, untied
+from fflin.base.validation import by_name, instance, untied
 from fflin.campaign.runs import CampaignJob
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 _ANY_SPREAD = (0.0, 1.0)
 
 
-def replay_settings(
-    dispersions: Mapping[str, object], options: Mapping[str, object]
-) -> dict[str, object]:
+def replay_settings(dispersions: object, options: Mapping[str, object]) -> dict[str, object]:
     """Return what is needed to repeat the runs of a call, as JSON values.
 
     The result contains the dispersed names, each with a flag whether the names of a pattern share
@@ -40,7 +38,8 @@ def replay_settings(
             missing.append(name)
         else:
             kept[name] = _plain(value)
-    names = {key: untied(key, spread)[1] for key, spread in dispersions.items()}
+    spreads = by_name("dispersions", dispersions, "name")
+    names = {key: untied(key, spread)[1] for key, spread in spreads.items()}
     return {"dispersions": names, "options": kept, "missing": missing}
 
 
