@@ -256,7 +256,7 @@ def _require_room(size: int) -> None:
         raise MemoryError
 
 
-def _of_mat(value: object) -> object:
+def _of_mat(value: Any) -> object:
     """Convert a MATLAB variable.
 
     Text becomes a str, cells or text rows a list, a struct a dict, and a sparse matrix an array.
