@@ -192,6 +192,7 @@ def test_a_terminal_shows_the_seconds_of_a_compilation(monkeypatch):
         assert stderr.getvalue().endswith("\r\x1b[2K") == shown
 
 
+@pytest.mark.compiled
 def test_code_that_cannot_be_stored_is_compiled_and_told_once(compiled, caplog, signatures):
     compiled.stats.cache_path = None
     kernel_code._said_unstored.clear()
