@@ -30,7 +30,12 @@ class Progress:
         self._start = time.monotonic()
         self._next = self._start + (_PATIENCE if shown is None else 0.0)
         self._drawn = False
+        self._announced = ""
         self.done, self.total = 0, 0
+
+    def announce(self, text: str) -> None:
+        """Print a text on stderr when the first step is done, so that no error follows it."""
+        self._announced = text
 
     def expect(self, seconds: float, cores: int) -> None:
         """Print the estimated duration of a computation, if it is at least 10 s."""
@@ -47,6 +52,9 @@ class Progress:
         After 20 s, also show `hint`.
         """
         self.done, self.total = done, total
+        if self._announced:
+            print(self._announced, file=sys.stderr)
+            self._announced = ""
         if self._shown:
             share = done / total
             spent = time.monotonic() - self._start

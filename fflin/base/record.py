@@ -238,7 +238,7 @@ def _unpacked_size(content: bytes) -> int:
     while at + 8 <= len(data):
         kind = int.from_bytes(data[at : at + 4], order)
         size = int.from_bytes(data[at + 4 : at + 8], order)
-        body = data[at + 8 : at + 8 + size]
+        body: bytes | memoryview = data[at + 8 : at + 8 + size]
         total += len(body)
         if kind == _MAT_COMPRESSED:
             unpacking = zlib.decompressobj()

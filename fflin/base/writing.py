@@ -8,7 +8,6 @@
 """
 
 import csv
-import io
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,6 +15,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 from fflin.base.errors import FileError, InputError
 from fflin.base.process import same_file
@@ -122,9 +122,11 @@ def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
 
 def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
     """Return the content of a CSV file."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    # The writer calls `write` once for each row. It quotes a cell with a line break only if the
+    # break is part of `lineterminator`.
+    lines = list[str]()
+    csv.writer(SimpleNamespace(write=lines.append), lineterminator="\r\n").writerows(rows)
+    return "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode()
 
 
 def write_atomically(contents: Mapping[Path, bytes]) -> None:

@@ -15,7 +15,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -236,22 +236,48 @@ class FileStore:
         self.path, self.part, self.count = path, part_of(path), count
         self._shapes, self._constants = shapes, constants
         self._texts = {**texts, "constant": json.dumps(list(constants))}
+        _remove_empty(self.part)
         self.resumed = self.part.exists()
-        with self._reported():
-            if not self.resumed:
-                size = 8 * count * sum(map(math.prod, shapes.values()))
-                try:
-                    _reserve(self.part, size + _OVERHEAD)
-                except BaseException:
-                    self.part.unlink(missing_ok=True)
-                    raise
-            self._file = hdf5().File(self.part, "r+" if self.resumed else "w", libver=CHECKED)
+        if self.resumed:
+            with self._reported():
+                self._file = hdf5().File(self.part, "r+", libver=CHECKED)
+            try:
+                with self._reported():
+                    self._begin(request, chunk)
+                    _reserve(self.part, self.part.stat().st_size)
+            except BaseException:
+                self.close()
+                raise
+            return
+        # The file gets its name only when it is complete but for the results, and open. So a crash
+        # leaves no half-made file of this name, and of several runs only one can begin it.
+        new = self.part.with_name(f".fflin-{os.urandom(8).hex()}")
         try:
             with self._reported():
-                self._begin(request, chunk)
-        except BaseException:
-            (self.close if self.resumed else self.discard)()
-            raise
+                _reserve(new, 8 * count * sum(map(math.prod, shapes.values())) + _OVERHEAD)
+                self._file = hdf5().File(new, "w", libver=CHECKED)
+            try:
+                with self._reported():
+                    self._begin(request, chunk)
+                    _reserve(new, new.stat().st_size)
+                    self._name(new)
+            except BaseException:
+                self.close()
+                raise
+        finally:
+            new.unlink(missing_ok=True)
+
+    def _name(self, new: Path) -> None:
+        """Give the new file its name NAME.part, unless another file has this name."""
+        try:
+            os.link(new, self.part)  # fails if the name exists, even as a link to nothing
+        except FileExistsError:
+            raise FileError(
+                f"{self.part} was begun by another run at the same time; wait for that run, or "
+                "choose another name"
+            ) from None
+        except OSError:  # a file system without links
+            os.rename(new, self.part)
 
     def _begin(self, request: str, chunk: int) -> None:
         attributes, create = self._file.attrs, self._file.require_dataset
@@ -274,7 +300,6 @@ class FileStore:
         create(CHECKSUM, (32,), np.uint8)
         attributes.update({**self._texts, "chunk": self.chunk, "request": request})
         self._file.flush()
-        _reserve(self.part, self.part.stat().st_size)
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
@@ -350,6 +375,13 @@ def _reserve(path: Path, size: int) -> None:
             os.posix_fallocate(file.fileno(), 0, size)
 
 
+def _remove_empty(part: Path) -> None:
+    """Remove an unfinished file of 0 bytes, which has no results."""
+    with suppress(OSError):
+        if part.stat().st_size == 0:
+            part.unlink()
+
+
 def require_room(path: Path, size: int) -> None:
     """Raise `FileError` if less than `size` bytes of the disk are free."""
     if size > (free := shutil.disk_usage(path.parent).free):
@@ -366,7 +398,10 @@ def output_path(out: str | Path) -> Path:
     if path.suffix == ".h5":
         hdf5()  # raises an error if h5py is not installed
     writing.check_output_path(path)
-    writing.check_output_path(part_of(path))
+    part = part_of(path)
+    writing.check_output_path(part)
+    if os.path.islink(part):
+        raise FileError(f"{part} is a link, expected no file or an unfinished one; remove the link")
     return path
 
 

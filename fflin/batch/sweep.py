@@ -25,7 +25,7 @@ from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.kernel.compiled import compiles, numba_is_there
+from fflin.kernel.compiled import compiles, numba_is_there, without_numba
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.linear.linearization import LARGEST, Linearizer, Prepared
 from fflin.linear.state_equations import assemble, drift
@@ -180,7 +180,7 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
     if prepared.sensing is not None:
         reason = "the outputs are not the state"
     elif not numba_is_there():
-        reason = "numba is not installed (pip install 'fflin[fast]')"
+        reason = without_numba()
     elif robot.orbit:
         reason = f"'{robot.name}' is in orbit"
     elif tree is None:

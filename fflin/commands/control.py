@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -285,8 +284,8 @@ def sweep(arguments: Namespace) -> Report:
     resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
     said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
-    print(f"fflin: {said}", file=sys.stderr)  # after all options have been checked
     with going_on(path, "points") as progress:
+        progress.announce(f"fflin: {said}")
         work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
         batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)

@@ -144,7 +144,7 @@ class Gain(ModelDesign):
         super().__post_init__()
         states = self.regulated or self.state_names
         require_known("state", states, self.state_names)
-        if len(self.poles) != len(states):
+        if not 0 < len(self.poles) <= len(states):
             raise InputError(f"{len(self.poles)} poles for {len(states)} regulated states")
 
     def _report(self) -> str:

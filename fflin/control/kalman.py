@@ -245,18 +245,16 @@ def kalman(
     lin = _estimated_part(lin, through @ noise, wheel_speeds)
     S = selection(lin.state_names, whole.state_names)
     seen = outputs_of(whole, S)
-    with np.errstate(over="ignore", invalid="ignore"):
-        W = S @ through @ noise @ through.T @ S.T
-        V = seen @ V @ seen.T
-    for name, covariance in (("W", W), ("V", V)):
-        if not np.isfinite(covariance).all():
-            raise InputError(f"{name} is so large that its product with the model overflows")
-    W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
     C = np.ascontiguousarray(lin.C)
     try:
-        require_disturbed(lin, W)
-        solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
+        # NumPy's warnings are not needed, because no filter is found if W or V overflows.
+        with np.errstate(over="ignore", invalid="ignore"):
+            W = S @ through @ noise @ through.T @ S.T
+            V = seen @ V @ seen.T
+            W = 0.5 * W + 0.5 * W.T
+            require_disturbed(lin, W)
+            solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,6 +48,7 @@ _INTERVAL = 1.0  # [s] between updates of the time that a terminal shows during 
 
 _log = logging.getLogger("fflin")
 _TURN, _COMPILING = Lock(), RLock()
+_said_unstored: list[bool] = []
 
 
 def available_cores() -> int:
@@ -69,8 +70,20 @@ def available_cores() -> int:
 
 
 def numba_is_there() -> bool:
-    """Return whether numba is installed."""
-    return find_spec("numba") is not None
+    """Return whether numba is installed and compiles."""
+    return find_spec("numba") is not None and not _numba_is_disabled()
+
+
+def _numba_is_disabled() -> bool:
+    """Return whether the user has switched numba off, so that it leaves functions as they are."""
+    return os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
+
+
+def without_numba() -> str:
+    """Return the reason why numba cannot be used."""
+    if _numba_is_disabled():
+        return "the environment variable NUMBA_DISABLE_JIT switches numba off"
+    return "numba is not installed (pip install 'fflin[fast]')"
 
 
 def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
@@ -105,7 +118,11 @@ def _prepared(module: str, name: str) -> Compiled:
     from fflin.kernel.machine_code import translated
 
     compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name), "compiled")
-    compile, folder = compiled.compile, Path(str(compiled.stats.cache_path))
+    compile = compiled.compile
+    if compiled.stats.cache_path is None:
+        compiled.compile = partial(_compile_unstored, compile, name)
+        return compiled
+    folder = Path(str(compiled.stats.cache_path))
     lock = folder / f"{module}.{name}.lock"
     with _between_processes(lock):
         for entry in _stored(folder, module, name)[1]:
@@ -128,6 +145,20 @@ def _prepared(module: str, name: str) -> Compiled:
 
     compiled.compile = compile_alone
     return compiled
+
+
+def _compile_unstored(compile: Callable[[object], object], name: str, signature: object) -> object:
+    """Compile a function whose machine code cannot be stored; say so once per process."""
+    with _COMPILING:
+        if not _said_unstored:
+            _said_unstored.append(True)
+            _log.warning(
+                "fflin: compiling without storing the code, because neither the folder of fflin "
+                "nor the user's cache folder is writable; every process compiles again. Set "
+                "NUMBA_CACHE_DIR to a writable folder"
+            )
+        with _seconds_shown(_COMPILED[name]):
+            return compile(signature)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache, partial, wraps
 from types import FunctionType, ModuleType
 from typing import NamedTuple, Protocol, TypeAlias
@@ -370,7 +371,7 @@ _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
 _DECORATORS = {
     "inlined": numba.njit(forceinline=True, **_PART),
     "called": numba.njit(**_PART),
-    "compiled": numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS),
+    "compiled": numba.njit(nogil=True, boundscheck=False, **_OPTIONS),
 }
 
 
@@ -389,7 +390,7 @@ def translated(function: FunctionType, how: str = "") -> Compiled:
     """Return a function of the kernel as a numba function that calls only numba functions.
 
     By default, the function becomes a part. For a function that Python calls, `how` must be
-    "compiled", and numba stores the machine code on disk.
+    "compiled", and numba stores the machine code on disk if any of its folders is writable.
     """
     names = {"__name__": function.__module__, **function.__globals__}
     for name in function.__code__.co_names:
@@ -398,7 +399,14 @@ def translated(function: FunctionType, how: str = "") -> Compiled:
     twin = FunctionType(
         function.__code__, names, function.__name__, function.__defaults__, function.__closure__
     )
-    return _DECORATORS[how or ("called" if function in uncompiled.CALLED else "inlined")](twin)
+    usual = "called" if function in uncompiled.CALLED else "inlined"
+    made = _DECORATORS[how or usual](twin)
+    if how == "compiled":
+        # numba raises RuntimeError if neither the folder of the source nor the cache folder of
+        # the user is writable.
+        with suppress(RuntimeError):
+            made.enable_caching()
+    return made
 
 
 def _counterpart(value: object) -> object:

@@ -205,7 +205,11 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
     check_ending(source, FORMATS)
     with reading(source, "trajectory"):
         table = source.suffix == ".csv"
-        entries, verified = _columns(source) if table else read_record(source)
+        if table:
+            state = StateMap(robot)
+            entries, verified = _columns(source, {*state.names, *Actuation(state).names})
+        else:
+            entries, verified = read_record(source)
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
     with located(str(source)):
@@ -264,10 +268,15 @@ def arguments(
     return found_as | {"q": q, "v": v}
 
 
-def _columns(path: Path) -> tuple[Record, bool]:
-    """Return the columns of a csv as {name: texts}, and whether their digest was verified."""
+def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:
+    """Return the columns of a csv as {name: texts}, and whether their digest was verified.
+
+    Spaces around a cell are removed, except in the names `known`.
+    """
     lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
-    header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
+    names, *rows = [line for line in lines if any(line)]
+    header = [name if name in known else name.strip() for name in names]
+    rows = [[cell.strip() for cell in row] for row in rows]
     if len({*header}) < len(header):
         raise ValueError("two of its columns have the same name")
     for number, row in enumerate(rows, 2):

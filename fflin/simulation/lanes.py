@@ -21,7 +21,7 @@ from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, d
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
-from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there
+from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there, without_numba
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
@@ -61,7 +61,7 @@ def not_compilable(plan: Plan) -> str:
     designs = [plan.policy.design] if isinstance(plan.policy, Allocation) else []
     reason = ""
     if not numba_is_there():
-        reason = "numba is not installed (pip install 'fflin[fast]')"
+        reason = without_numba()
     elif plan.events or plan.options.callback or plant.disturbance or plant.field:
         reason = "events, callbacks, disturbances and the field of an orbit are computed in Python"
     elif not (policy is None or type(policy) in _KNOWN or isinstance(policy, Gridded)):

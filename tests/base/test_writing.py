@@ -1,5 +1,7 @@
 """The one rule for files: a regular one or a new name, never an input, whole or not at all."""
 
+import csv
+import io
 import json
 import os
 import re
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.writing import check_output_path, reason, replacing, write_atomically
+from fflin.base.writing import check_output_path, csv_table, reason, replacing, write_atomically
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import run
 from tests.support.messages import says
@@ -296,3 +298,10 @@ def test_a_reason_is_never_empty():
     assert reason(EOFError()) == "the file ends too early"
     assert reason(NotImplementedError()) == "NotImplementedError"
     assert reason(KeyError("q")) == "it has no entry 'q'"
+
+
+def test_names_with_breaks_and_spaces_are_read_back_from_a_table():
+    cells = ["a\rb", "c ", "d\ne", " x", 'q"', "a\r\nb", ","]
+    content = csv_table([cells, cells])
+    assert list(csv.reader(io.StringIO(content.decode(), newline=""))) == [cells, cells]
+    assert csv_table([["a", 1.5], ["b", 2]]) == b"a,1.5\nb,2\n"

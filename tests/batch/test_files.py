@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.batch.files import FileStore
+from fflin.batch.files import FileStore, output_path
 from tests.support.patience import finished, finishing
 from tests.support.robots import singular_at
 from tests.support.sweeps import assert_same, points
@@ -276,3 +276,73 @@ def test_without_h5py_the_error_names_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(fflin.MissingPackageError, match="h5py"):
         fflin.LinearBatch.load(path)
+
+
+@pytest.mark.compiled
+def test_an_empty_unfinished_file_does_not_stop_the_next_run(robot, tmp_path):
+    q, _, _ = points(robot, 8)
+    path = tmp_path / "b.h5"
+    (tmp_path / "b.h5.part").touch()
+    assert len(fflin.sweep(robot, q, out=path, threads=1)) == 8
+    assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def store(path, request="a"):
+    return FileStore(path, request, 8, 4, {"x": (2,)}, {}, {})
+
+
+@pytest.mark.parametrize("step", ["_begin", "_name"])
+def test_a_run_that_ends_before_it_begins_leaves_no_unfinished_file(step, tmp_path, monkeypatch):
+    def killed(*_):
+        raise Killed
+
+    path = tmp_path / "b.h5"
+    with monkeypatch.context() as patched:
+        patched.setattr(FileStore, step, killed)
+        with pytest.raises(Killed):
+            store(path)
+    assert not (tmp_path / "b.h5.part").exists()
+    store(path).discard()
+
+
+def test_of_runs_that_begin_one_file_at_once_exactly_one_goes_on(tmp_path, monkeypatch):
+    path = tmp_path / "b.h5"
+    begun, original = [], FileStore._name
+
+    def late(self, new):
+        # Two other runs begin the file while this one prepares its own.
+        if not begun:
+            begun.append(self)
+            begun.append(store(path))
+            with pytest.raises(fflin.FileError):
+                store(path, "b")
+        original(self, new)
+
+    monkeypatch.setattr(FileStore, "_name", late)
+    with pytest.raises(fflin.FileError, match="at the same time"):
+        store(path)
+    _, first = begun
+    rows = {"x": np.ones((4, 2))}
+    for start in (0, 4):
+        first.write(start, start + 4, rows)
+    assert (first.complete()["x"] == 1.0).all()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
+
+
+def test_an_unfinished_file_is_not_written_through_a_link(tmp_path):
+    target, path = tmp_path / "other", tmp_path / "b.h5"
+    (tmp_path / "b.h5.part").symlink_to(target)
+    for content in (None, b"kept"):
+        if content:
+            target.write_bytes(content)
+        with pytest.raises(fflin.FileError, match="is a link"):
+            output_path(path)
+    assert target.read_bytes() == b"kept"
+    target.unlink()
+    with pytest.raises(fflin.FileError):
+        store(path)
+    assert not target.exists()

@@ -138,3 +138,10 @@ def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     assert re.fullmatch(going_on, last)
     assert "Traceback" not in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["x.h5.part"]
+
+
+def test_a_sweep_that_is_refused_says_only_why(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "g.h5.part").write_bytes(b"not a file of HDF5")
+    # Only one line on stderr: no line on the work and its size before the error.
+    assert "g.h5.part" in refused("sweep", "ets_vii", "--random", "6", "-o", "g.h5")

@@ -190,3 +190,50 @@ def test_a_terminal_shows_the_seconds_of_a_compilation(monkeypatch):
             time.sleep(0.1)
         assert ("compiling the loop: 0 s " in stderr.getvalue()) == shown
         assert stderr.getvalue().endswith("\r\x1b[2K") == shown
+
+
+@pytest.mark.compiled
+def test_code_that_cannot_be_stored_is_compiled_and_told_once(compiled, caplog, signatures):
+    compiled.stats.cache_path = None
+    kernel_code._said_unstored.clear()
+    found = kernel_code.kernel("derivatives", "derive")
+    found.compile("double")
+    found.compile("long")
+    kernel_code._said_unstored.clear()
+    assert signatures == ["double", "long"]
+    (record,) = caplog.records
+    assert "NUMBA_CACHE_DIR" in record.message
+
+
+@pytest.mark.compiled
+def test_numba_without_a_writable_folder_compiles_without_storing(monkeypatch):
+    from numba.core import caching
+
+    from fflin.kernel import derivatives, machine_code
+
+    # So numba finds no folder, as if it were installed read-only and without a home.
+    monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
+    machine_code.translated.cache_clear()
+    try:
+        found = machine_code.translated(derivatives.derive, "compiled")
+    finally:
+        machine_code.translated.cache_clear()
+    assert found.stats.cache_path is None
+
+
+@pytest.mark.parametrize("engine", [None, "compiled"])
+def test_numba_that_is_switched_off_is_not_used(engine, monkeypatch):
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    robot = fflin.load("cubesat")
+    if engine:
+        for call in (
+            lambda: fflin.sweep(robot, [robot.neutral()], engine=engine),
+            lambda: fflin.simulate(robot, duration=0.02, engine=engine),
+        ):
+            with pytest.raises(fflin.InputError, match="NUMBA_DISABLE_JIT"):
+                call()
+        return
+    assert not kernel_code.numba_is_there()
+    assert len(fflin.sweep(robot, [robot.neutral()], threads=1)) == 1
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "0")
+    assert "not installed" in kernel_code.without_numba()

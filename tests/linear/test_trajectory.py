@@ -378,3 +378,18 @@ def test_a_base_that_turns_too_far_between_knots_is_told():
         v0 = fflin.velocity(robot, {"omega_b.z": speed})
         spin = fflin.simulate(robot, v0=v0, duration=4.0, dt=0.01, every=100).trajectory()
         assert ("the base rotates by 3.3 rad from t = 0 to 1 s" in str(spin)) == far
+
+
+@pytest.mark.parametrize("name", ["hinge ", " hinge", "hinge\rof", "a\nb"])
+def test_a_csv_with_odd_joint_names_is_read_back(name, tmp_path):
+    model = pin.Model()
+    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    model.appendBodyToJoint(root, pin.Inertia.Random(), pin.SE3.Identity())
+    joint = model.addJoint(root, pin.JointModelRX(), pin.SE3.Identity(), name)
+    model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
+    robot = fflin.from_model(model)
+    rows = [np.tile(x, (2, 1)) for x in (robot.neutral(), np.zeros(robot.nv), np.arange(7.0))]
+    before = fflin.Trajectory(robot, [0.0, 1.0], *rows)
+    before.save(tmp_path / "a.csv")
+    after = fflin.Trajectory.load(tmp_path / "a.csv", robot)
+    assert (after.u == before.u).all() and after.verified

@@ -93,7 +93,13 @@ def light(folder):
         "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
         "CenterOfMass": {},
         "capture": {
-            **{"robot": robot, "frame": "hand", "payload": pin.Inertia.Random(), "q": q, "v": v},
+            **{
+                "robot": robot,
+                "frame": "hand",
+                "payload": pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3)),
+                "q": q,
+                "v": v,
+            },
             **{"placement": pin.SE3.Identity(), "payload_q": None, "payload_v": np.zeros(6)},
             "prefix": "caught",
         },
