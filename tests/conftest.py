@@ -108,3 +108,18 @@ def browser():
     """One Chromium for the pages of all tests."""
     with chromium() as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def brief_validity():
+    """Shorten the runs of `validity`, for tests that do not judge how accurate they are.
+
+    The runs predict one time constant instead of three, in longer steps, and have settled at a
+    fifth of the start. So a region takes a tenth of the time.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fflin.campaign.settling._CONSTANTS", 1.0)
+        patch.setattr("fflin.campaign.settling._STEP_PREDICTED", 1.0)
+        patch.setattr("fflin.campaign.settling._STEP", 1.0)
+        patch.setattr("fflin.campaign.settling.SETTLED", 0.2)
+        yield

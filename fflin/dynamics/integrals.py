@@ -104,8 +104,12 @@ def screw_of(model: pin.Model, joint: pin.JointModel) -> Screw | None:
     # Pinocchio.
     if np.abs(linear - slide * axis).max() > 1e-12:
         return None
-    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
-    return Screw(pin.SE3(rotation.normalized().matrix(), np.zeros(3)), turn, slide)
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).normalized().matrix()
+    # For an axis along x, y or z, all entries are 0 or 1. Rounding errors in their place would move
+    # a planar robot out of its plane.
+    whole = rotation.round()
+    rotation = np.where(np.abs(rotation - whole) < 1e-15, whole, rotation)
+    return Screw(pin.SE3(rotation, np.zeros(3)), turn, slide)
 
 
 def integrals(robot: Robot, q: Array, v: Array) -> Integrals:

@@ -117,13 +117,13 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory):
+def python(tmp_path_factory, brief_validity):
     folder = tmp_path_factory.mktemp("json")
     (folder / "u.toml").write_text('[dispersions]\n"q_m" = 0.05\n"omega_b.z" = 0.02\n')
     robot = fflin.load(ROBOT)
     fflin.lqr(fflin.linearize(robot)).save(folder / "gain.npz")
     spin = fflin.velocity(robot, {"omega_b.z": 0.05})
-    fflin.simulate(robot, v0=spin, duration=1.0).trajectory().save(folder / "plan.npz")
+    fflin.simulate(robot, v0=spin, duration=0.2).trajectory().save(folder / "plan.npz")
     there = Python(folder)
     there.check = fflin.check(robot, there.lin)
     there.schedule = fflin.tvlqr(there.along)

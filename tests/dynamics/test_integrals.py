@@ -113,3 +113,12 @@ def test_rows_beyond_a_chunk_are_computed_too(monkeypatch):
     monkeypatch.setattr("fflin.dynamics.integrals._ROWS", 4)
     for one, other in zip(whole, integrals(robot, q, v), strict=True):
         assert np.array_equal(one, other)
+
+
+def test_a_planar_robot_keeps_to_its_plane_exactly():
+    robot = fflin.load("planar_detumble")
+    q = robot.neutral()[None]
+    v = fflin.velocity(robot, {"omega_b.z": 0.05})[None]
+    momentum = integrals(robot, q, v).momentum[0]
+    assert momentum[5] > 0.0
+    assert not momentum[[2, 3, 4]].any()
