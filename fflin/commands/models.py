@@ -323,6 +323,7 @@ def equilibrium(arguments: Namespace) -> Report:
     example: fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01
     """
     from fflin.base.record import write_record
+    from fflin.linear.holding import wheel_notes
     from fflin.robot.fields import limits_of
 
     refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
@@ -341,6 +342,7 @@ def equilibrium(arguments: Namespace) -> Report:
         f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
         signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
         str(held),
+        *(folded([note]) for note in wheel_notes(lin)),
     ]
     names = (*lin.state_names, *lin.input_names)
     there = dict(zip(names, (*lin.x0, *held.u), strict=True))

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.ranks import null_space
 from fflin.analysis.reduction import ignorable_wheels, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
@@ -322,8 +322,9 @@ def _of_regulated(
         # The combinations of inputs in the null space of `forces` accelerate the wheels, but exert
         # no force on the robot without its wheels. X maps coordinates in this null space to the
         # accelerations of the wheels.
-        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
-        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels))
+        idle, _ = null_space(forces @ np.diag(1.0 / root))
+        X = S @ lin.B / root @ idle / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
         rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
     return Q, R, rule, terms
