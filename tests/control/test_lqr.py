@@ -432,8 +432,8 @@ def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("dt", [0.02, 3.0])
 def test_a_sampled_point_is_refused_with_the_rates_of_the_robot(moving, dt):
-    # Every body falls at g, and the joints cannot hold the base. A sample of A and f0 also moves the
-    # position, but the robot is at rest.
+    # Every body falls at g, and the joints cannot hold the base. A sample of A and f0 also moves
+    # the position, but the robot is at rest.
     robot = fflin.load("planar_detumble", gravity=(0.0, 0.0, -9.81))
     robot = robot.replace(inputs=[fflin.JointTorque("*")])
     lin = fflin.linearize(robot, moving=moving)
