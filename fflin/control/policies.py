@@ -383,5 +383,11 @@ def fed_back(policy: object) -> tuple[str, ...]:
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
     names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
-    used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(compress(names, used))
+    if K is not None:
+        return tuple(compress(names, np.abs(K).max(axis=0, initial=0.0)))
+    system = getattr(decider(policy), "system", None)
+    if lin is None or system is None:
+        return names
+    # A controller of outputs feeds back the states that its outputs measure.
+    outputs = system.B.any(axis=0) | system.D.any(axis=0)
+    return tuple(compress(names, lin.C[outputs].any(axis=0)))

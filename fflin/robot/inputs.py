@@ -155,6 +155,8 @@ class Thruster(Input):
         Smallest impulse [N s] that the thruster can produce in a sample. If the commanded impulse
         is smaller, the thruster does not fire, and this impulse is added to the command of the next
         sample.
+    isp : float, optional
+        Specific impulse [s], with which the report of a simulation computes the propellant.
 
     Examples
     --------
@@ -171,9 +173,12 @@ class Thruster(Input):
     name: str | None = None
     on_off: bool = field(default=False, kw_only=True, repr=False)
     least_impulse: float | None = field(default=None, kw_only=True, repr=False)
+    isp: float | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.isp is not None:
+            self._set("isp", positive("thruster isp", self.isp, "s"))
         pulses = truth("thruster on_off", self.on_off)
         if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(

@@ -314,7 +314,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     ``joint_torque``    `JointTorque`    ``joint``
     ``thruster``        `Thruster`       ``frame``, ``position`` [m] and
                                          ``direction``; optional: ``name``,
-                                         ``on_off``, ``least_impulse`` [N s]
+                                         ``on_off``, ``least_impulse`` [N s],
+                                         ``isp`` [s]
     ``reaction_wheel``  `ReactionWheel`  ``axis``; optional: ``frame``, ``name``,
                                          and either ``inertia`` [kg m^2] with
                                          ``max_speed`` [rad/s], or ``momentum``

@@ -200,7 +200,7 @@ def sound(folder):
         | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
-            **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
+            **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1, "isp": 220.0},
         },
         "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "hold": None, "frame": "local"},
