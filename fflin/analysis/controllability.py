@@ -1,5 +1,6 @@
 """Controllability of a linear model, and checks before the design of regulators and filters."""
 
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -476,10 +477,33 @@ def _remedies(lin: LinearModel, conserved: ConservedMomenta) -> str:
     of_joint = [name.startswith("qdot_m.") for name in lin.state_names[len(lin.M) :]]
     advice = ""
     if conserved.weights[:, of_joint].any():
+        # The names of these joints, as a pattern if they differ only by their ends.
+        loose = [
+            name.removeprefix("momentum of ")
+            for name in mechanics.momentum_names(lin, conserved)[: len(conserved.weights)]
+            if name.startswith("momentum of ") and " + " not in name and " - " not in name
+        ]
         advice += ", add a spring to any joint that no input moves (--stiffness, stiffness=)"
+        if loose:
+            names = ", ".join(f'"{name}"' for name in _patterns(lin, loose))
+            advice += f", lock such joints (lock = [{names}], --lock)"
     if len(conserved.weights) and len(conserved.kept):
         advice += ", or design on fflin.momentum_reduction(lin) (--reduce)"
     return advice
+
+
+def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
+    """Return patterns that match exactly the given joints of a model, such as ``arm_*``."""
+    everything = [x.removeprefix("q_m.") for x in lin.state_names if x.startswith("q_m.")]
+    groups = dict[str, list[str]]()
+    for name in joints:
+        groups.setdefault(re.sub(r"[0-9]+$", "", name), []).append(name)
+    patterns = list[str]()
+    for stem, names in groups.items():
+        same = [name for name in everything if name.startswith(stem)]
+        whole = len(names) > 1 and bool(stem) and len(same) == len(names)
+        patterns += [f"{stem}*"] if whole else names
+    return patterns
 
 
 def require_detectable(lin: LinearModel) -> None:

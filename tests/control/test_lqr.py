@@ -250,6 +250,11 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     loose = panels(damping=0.0).replace(stiffness={})
     with pytest.raises(fflin.StabilizabilityError, match=r"momentum of h1.*--stiffness.*--reduce"):
         fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
+    with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h\*"\], --lock'):
+        fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
+    one = [*base, fflin.JointTorque("h2")]
+    with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h1"\], --lock'):
+        fflin.lqr(fflin.linearize(loose.replace(inputs=one)), 1.0, 1.0)
     hub = fflin.load("cubesat", inputs=[fflin.BaseForce()])
     with pytest.raises(fflin.StabilizabilityError, match=r"angular momentum.*--reduce") as told:
         fflin.lqr(fflin.linearize(hub))
