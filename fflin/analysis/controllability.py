@@ -608,11 +608,18 @@ def _reached(
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the states with the largest entries in vectors (k, nx), for a message."""
-    sizes = np.abs(vectors)
-    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
-    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
-    count = len(vectors)
-    if large.sum() <= count:
-        return words
-    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"
+    """Name the states on which vectors (k, nx) depend, for a message.
+
+    A single vector is described by its largest entries. Several vectors span a space, so they are
+    described by states that determine a vector of this space, if possible states of the base.
+    """
+    if len(vectors) == 1:
+        sizes = np.abs(vectors[0])
+        large = sizes >= 0.3 * sizes.max()
+        words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+        return words if large.sum() == 1 else f"a combination of {words}"
+    parts = np.vstack((vectors.real, vectors.imag))
+    space, _ = ranks.image(parts.T, 1e-6)
+    of_base = [not name.partition(".")[0].endswith("_m") for name in names]
+    _, pivots = ranks.echelon(space, np.ones(len(names)), np.array(of_base))
+    return listed(names[i] for i in pivots)

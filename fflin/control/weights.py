@@ -17,6 +17,7 @@ from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import require_chart
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
 
@@ -91,6 +92,9 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
     sizes = numbers("largest", largest, "name", "largest value of")
+    for key, size in sizes.items():
+        if key.startswith("q_b"):
+            require_chart(f"largest value of '{key}'", size)
     values = {key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()}
     return _diagonal("largest", values, names, complete=of_inputs)
 
@@ -343,6 +347,8 @@ def _weights_of(
             if of_robot and not stands_for_any(key, known):
                 continue  # a reduced model may lack states that the robot's weights name
             what, largest = f"largest value of '{key}' (--bryson)", part == "bryson"
+            if largest and key.startswith("q_b"):
+                require_chart(what, value)
             values[key] = inverse_square(what, value) if largest else value, key, largest
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}

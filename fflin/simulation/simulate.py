@@ -142,7 +142,9 @@ def simulate(
         - a number: the largest magnitude of every input;
         - a mapping {input, group or pattern: magnitude, or (lower, upper)};
         - a list in which explicit limits take precedence over "urdf", such as
-          ``["urdf", {"tau_m": 5.0}]``.
+          ``["urdf", {"tau_m": 5.0}]``, and later mappings over earlier ones.
+
+        One side of a limit may be infinite.
 
         On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
     disturbance : callable, optional

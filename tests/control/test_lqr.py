@@ -261,6 +261,38 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     assert "spring" not in str(told.value)
 
 
+def test_a_largest_q_b_beyond_a_quaternion_is_refused(lin):
+    """Degrees or radians for q_b, whose magnitude is the sine of half the angle."""
+    robot = fflin.load("ets_vii")
+    for refused in (
+        lambda: fflin.bryson(lin, {"q_b": 5.0}),
+        lambda: fflin.lqr(lin, weights={"bryson": {"q_b.x": 5.0}}),
+        lambda: robot.replace(weights={"bryson": {"q_b": 1.5}}),
+        lambda: robot.replace(limits={"q_b": 30.0}),
+    ):
+        with pytest.raises(fflin.InputError, match=r"at most 1.*sin\(x / 2\)"):
+            refused()
+    assert fflin.bryson(lin, {"q_b": 1.0})[0] == 1.0
+
+
+def test_limits_may_be_lists_of_mappings_and_open_on_one_side(lin, gain):
+    robot, policy = fflin.load("ets_vii"), fflin.StateFeedback(lin, gain.K)
+    x0 = np.zeros(24)
+    x0[0] = 0.2
+
+    def largest(limits):
+        motion = fflin.simulate(robot, policy, x0=x0, duration=0.05, limits=limits)
+        return motion.u[:, 0].min(), motion.u[:, 0].max()
+
+    free = largest(None)
+    assert free[0] < -1.0
+    assert largest({"tau_b": (-1.0, np.inf)})[0] == -1.0
+    assert largest({"tau_b": (-np.inf, 1.0)}) == free
+    assert largest([{"tau_b": 1.0}, {"tau_b.x": 0.5}])[0] == -0.5
+    with pytest.raises(fflin.InputError, match=r"tau_b"):
+        largest({"tau_b": (np.inf, np.inf)})
+
+
 def test_springs_do_not_hide_that_momentum_is_conserved():
     robot = joints_only(fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0))
     with pytest.raises(fflin.StabilizabilityError, match="angular momentum"):
