@@ -383,7 +383,7 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     if not positions:
         return np.zeros(0, dtype=np.intp)
     source = lin.generator or lin
-    driven = mechanics.second_order(source).S.values.any(axis=1)
+    driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
     base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
     columns = np.concatenate((base, base + nv))
     on_others = np.delete(source.A[:, columns], columns, axis=0)

@@ -288,7 +288,7 @@ class _Balance:
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
         wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
         if spun:
-            wheels = [6 + robot.joint_names.index(name) for name in lin.wheels]
+            wheels = np.array([6 + robot.joint_names.index(name) for name in lin.wheels])
             others = _without_wheels(M, wheels)
             columns, wanted = others @ columns, others @ wanted
             terms, rounding = np.abs(others) @ terms, np.abs(others) @ rounding
@@ -314,7 +314,7 @@ class _Balance:
         return small or bool(rates <= self.lin.bound(TOLERANCE))
 
 
-def _without_wheels(M: Array, wheels: list[int]) -> Array:
+def _without_wheels(M: Array, wheels: Indices) -> Array:
     """Return the matrix (nv, nv) that maps forces to forces on the robot with free wheels.
 
     By the equation of motion, a free wheel takes the acceleration that its torque and the other
