@@ -1,5 +1,6 @@
 """Controllability of a linear model, and checks before the design of regulators and filters."""
 
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -476,10 +477,33 @@ def _remedies(lin: LinearModel, conserved: ConservedMomenta) -> str:
     of_joint = [name.startswith("qdot_m.") for name in lin.state_names[len(lin.M) :]]
     advice = ""
     if conserved.weights[:, of_joint].any():
+        # The names of these joints, as a pattern if they differ only by their ends.
+        loose = [
+            name.removeprefix("momentum of ")
+            for name in mechanics.momentum_names(lin, conserved)[: len(conserved.weights)]
+            if name.startswith("momentum of ") and " + " not in name and " - " not in name
+        ]
         advice += ", add a spring to any joint that no input moves (--stiffness, stiffness=)"
+        if loose:
+            names = ", ".join(f'"{name}"' for name in _patterns(lin, loose))
+            advice += f", lock such joints (lock = [{names}], --lock)"
     if len(conserved.weights) and len(conserved.kept):
         advice += ", or design on fflin.momentum_reduction(lin) (--reduce)"
     return advice
+
+
+def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
+    """Return patterns that match exactly the given joints of a model, such as ``arm_*``."""
+    everything = [x.removeprefix("q_m.") for x in lin.state_names if x.startswith("q_m.")]
+    groups = dict[str, list[str]]()
+    for name in joints:
+        groups.setdefault(re.sub(r"[0-9]+$", "", name), []).append(name)
+    patterns = list[str]()
+    for stem, names in groups.items():
+        same = [name for name in everything if name.startswith(stem)]
+        whole = len(names) > 1 and bool(stem) and len(same) == len(names)
+        patterns += [f"{stem}*"] if whole else names
+    return patterns
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -584,11 +608,18 @@ def _reached(
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the states with the largest entries in vectors (k, nx), for a message."""
-    sizes = np.abs(vectors)
-    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
-    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
-    count = len(vectors)
-    if large.sum() <= count:
-        return words
-    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"
+    """Name the states on which vectors (k, nx) depend, for a message.
+
+    A single vector is described by its largest entries. Several vectors span a space, so they are
+    described by states that determine a vector of this space, if possible states of the base.
+    """
+    if len(vectors) == 1:
+        sizes = np.abs(vectors[0])
+        large = sizes >= 0.3 * sizes.max()
+        words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+        return words if large.sum() == 1 else f"a combination of {words}"
+    parts = np.vstack((vectors.real, vectors.imag))
+    space, _ = ranks.image(parts.T, 1e-6)
+    of_base = [not name.partition(".")[0].endswith("_m") for name in names]
+    _, pivots = ranks.echelon(space, np.ones(len(names)), np.array(of_base))
+    return listed(names[i] for i in pivots)

@@ -9,7 +9,16 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis import mechanics, moving_points
-from fflin.analysis.ranks import FixedPoles, Margin, Noisy, divisors, echelon, image, null_space
+from fflin.analysis.ranks import (
+    EPS,
+    FixedPoles,
+    Margin,
+    Noisy,
+    divisors,
+    echelon,
+    image,
+    null_space,
+)
 from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.tables import counted, folded
@@ -374,7 +383,7 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     if not positions:
         return np.zeros(0, dtype=np.intp)
     source = lin.generator or lin
-    driven = mechanics.second_order(source).S.values.any(axis=1)
+    driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
     base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
     columns = np.concatenate((base, base + nv))
     on_others = np.delete(source.A[:, columns], columns, axis=0)
@@ -387,7 +396,10 @@ def rigid_forces(body: LinearModel) -> Noisy:
     """Return the input matrix (r, nu) of the r rigid motions, in which no spring is deflected."""
     system = mechanics.second_order(body)
     motions, _ = null_space(system.K.T, 1.0 / system.size)
-    return system.S.after(motions.T)
+    forces = system.S.after(motions.T)
+    # Rounding leaves a small part of every coordinate in each motion.
+    rounding = len(motions) * EPS * (np.abs(system.S.values) / system.size[:, None]).sum(axis=0)
+    return forces._replace(noise=forces.noise + rounding)
 
 
 def without(lin: LinearModel, removed: Indices) -> LinearModel:

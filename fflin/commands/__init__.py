@@ -4,3 +4,6 @@ This package imports every other package of fflin; no other package imports it.
 """
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+# Value of --orbit that removes the orbit of a robot file.
+NO_ORBIT = "none"

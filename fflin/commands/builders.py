@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, located
 from fflin.base.names import joints_by_name, rates_by_name
-from fflin.commands import DONE
+from fflin.commands import DONE, NO_ORBIT
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -67,6 +67,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
+    if given.get("orbit") == NO_ORBIT:
+        given["orbit"] = None
     # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
     # settings in `given` are applied after loading.
     first = {"passive": given.pop("passive")} if "passive" in given else {}
@@ -190,7 +192,7 @@ def model_about(
     """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium.
 
     --equilibrium and --relative-equilibrium compute the inputs of an equilibrium, and add the
-    spring deflections to q. With --reduce, the conserved momenta are removed from the model.
+    spring deflections to q.
     """
     axes = {"frame": arguments.frame, "reference": reference}
     given = once("--effort", arguments.effort)
@@ -200,8 +202,20 @@ def model_about(
         refuse(arguments, ("effort",), f"{by} already sets the inputs at the operating point")
         held = fflin.equilibrium(robot, q, v=v, **axes)
         q, u = held.q, held.u
-    lin = fflin.linearize(robot, q, v, u, **axes)
-    if getattr(arguments, "reduce", False):
+    return fflin.linearize(robot, q, v, u, **axes)
+
+
+def model_to_regulate(
+    robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
+) -> fflin.LinearModel:
+    """Linearise as `model_about` does, with the inputs that hold the robot at the point.
+
+    With --reduce, the conserved momenta are removed from the model.
+    """
+    from fflin.linear.holding import held_if_possible
+
+    lin = held_if_possible(model_about(robot, arguments, q, v, reference))
+    if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin
 
@@ -258,7 +272,7 @@ def designed(
     """Return the robot, the robot for the design, and the linear model and gain of the design."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
-    lin = model_about(design, arguments, *point_of(design, arguments))
+    lin = model_to_regulate(design, arguments, *point_of(design, arguments))
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
 
 
@@ -275,9 +289,6 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
     The options --weights, --q, --r and --bryson define the weights. With --sample, the model is
     first discretised. If `allocated` is true, the error for an unknown name mentions --no-allocate.
     """
-    from fflin.control.lqr import require_fixed_point
-
-    require_fixed_point(lin)
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
     try:
@@ -314,6 +325,12 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str,
         return None, settings | {"q0": q, "v0": v, "frame": arguments.frame}
     policy, linear, lin = about_point(robot, arguments)
     q, v = start_of(robot, arguments, linear.lin.reference)
+    if robot.orbit and linear.lin.q[:3].any() and not q[:3].any():
+        # The point was displaced so that the centre of mass is on the orbit. The start is, too.
+        from fflin.linear.equilibrium import on_orbit
+
+        if not point_of(robot, arguments, "target_")[0][:3].any():
+            q = on_orbit(robot, q, linear.lin.frame)
     if arguments.duration is None:
         design = policy.design if isinstance(policy, fflin.Allocation) else robot
         settings["duration"] = time_to_settle(design, linear, q, v)
@@ -366,7 +383,7 @@ def about_point(
     if gain:
         lin = _about_gain(design, gain, arguments)
     else:
-        lin = model_about(design, arguments, *point_of(design, arguments, "target_"))
+        lin = model_to_regulate(design, arguments, *point_of(design, arguments, "target_"))
     if arguments.mpc:
         from fflin.control.mpc import Mpc
 

@@ -69,7 +69,7 @@ def info(arguments: Namespace) -> Report:
     from fflin.control.authority import point_properties
     from fflin.dynamics.state import Actuation
     from fflin.robot.fields import limits_of
-    from fflin.robot.summary import robot_info
+    from fflin.robot.summary import ideal_inputs, robot_info
 
     robot = load_robot(arguments)
     q, v = state_of(robot, arguments, robot.point)
@@ -82,6 +82,10 @@ def info(arguments: Namespace) -> Report:
         rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
     table = grid(cut(rows, "see --json"), "ll")
     text = f"{robot_info(robot, str(properties))}\n\n{table}"
+    notes = robot.notes
+    if remark := ideal_inputs(robot):
+        notes = (*notes, remark)
+        text += f"\n\n{folded([f'warning: {remark}'])}"
     result = {
         "mass": robot.mass,
         **properties._asdict(),
@@ -92,7 +96,7 @@ def info(arguments: Namespace) -> Report:
         "input_names": inputs.names,
         "input_units": inputs.units,
         "limits": limits,
-        "notes": robot.notes,
+        "notes": notes,
     }
     return Report(robot.name, result, text)
 
@@ -122,8 +126,9 @@ def init(arguments: Namespace) -> Report:
     write_atomically({target: draft(robot, urdf).encode()})
     fflin.load(target)  # warns of settings that the file leaves open
     text = (
-        f"wrote {target}, a robot file of '{robot.name}'; to simulate the robot, run: fflin "
-        f"simulate {target}"
+        f"wrote {target}, a robot file of '{robot.name}', with an ideal torque and force on the "
+        "base until you uncomment its inputs; to simulate the robot, run: fflin simulate "
+        f"{target}"
     )
     return Report(robot.name, {}, text, {target: None})
 
@@ -323,6 +328,7 @@ def equilibrium(arguments: Namespace) -> Report:
     example: fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01
     """
     from fflin.base.record import write_record
+    from fflin.linear.holding import wheel_notes
     from fflin.robot.fields import limits_of
 
     refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
@@ -341,6 +347,7 @@ def equilibrium(arguments: Namespace) -> Report:
         f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
         signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
         str(held),
+        *(folded([note]) for note in wheel_notes(lin)),
     ]
     names = (*lin.state_names, *lin.input_names)
     there = dict(zip(names, (*lin.x0, *held.u), strict=True))

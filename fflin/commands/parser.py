@@ -16,7 +16,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from fflin.base.errors import FflinWarning, one_line
 from fflin.base.writing import RECORDS
-from fflin.commands import BAD_INPUT
+from fflin.commands import BAD_INPUT, NO_ORBIT
 from fflin.commands.options import ABOUT, COMMON, DESCRIPTIONS, OPTIONS, OUTPUT
 
 
@@ -106,8 +106,10 @@ def xacro_argument(text: str) -> tuple[str, str]:
     return name, value
 
 
-def orbit(text: str) -> dict[str, float | str]:
-    """Read ALTITUDE or ALTITUDE:BODY."""
+def orbit(text: str) -> dict[str, float | str] | str:
+    """Read ALTITUDE, ALTITUDE:BODY or none, which removes the orbit of a robot file."""
+    if text == NO_ORBIT:
+        return text
     altitude, _, body = text.partition(":")
     return {"altitude": number(altitude), "body": body or "earth"}
 
@@ -210,7 +212,7 @@ FORMS: dict[str, Form] = {
     "vary": many(parameter_range, "NAME=RANGE", required=True),
     "grid": many(grid_axis, "JOINT=LO:HI:N"),
     "range": many(joint_range, "JOINT=LO:HI"),
-    "orbit": one(orbit, "ALTITUDE[:BODY]"),
+    "orbit": one(orbit, "ALTITUDE[:BODY]|none"),
     "rpy": _ANGLES,
     "target-rpy": _ANGLES,
     "position": _AXES,

@@ -15,12 +15,13 @@ import numpy as np
 from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import group_of, input_keys
 from fflin.base.record import Design
-from fflin.base.tables import cut, grid, matrix, width
+from fflin.base.tables import cut, grid, matrix, signals, width
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
+from fflin.linear.holding import wheel_notes
 from fflin.linear.model import ControlSystem, LinearModel, state_space
 from fflin.robot.rotors import SPINNING
 
@@ -159,6 +160,7 @@ class Gain(ModelDesign):
         left = [name for name in self.state_names if self.regulated and name not in self.regulated]
         more = {
             "not regulated": f"{listed(left)} ({_why_not_regulated(left)})" if left else "",
+            "held at the operating point": "; ".join(self._held()),
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
         }
@@ -176,6 +178,14 @@ class Gain(ModelDesign):
         head = f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}"
         notes = [fold(f"{what}: {said}") for what, said in more.items() if said]
         return "\n\n".join((head, f"K ({nu} x {nx}){shown}", _poles(self), fold(figures), *notes))
+
+    def _held(self) -> list[str]:
+        """Return the inputs at the operating point, and the momentum that wheels gain there."""
+        if not self.u0.any():
+            return []
+        inputs = signals("u0", self.u0, self.input_names, self.input_units)
+        gained = () if self._lin is None else wheel_notes(self._lin)
+        return [" ".join(inputs.split()), *gained]
 
     @property
     def closed_loop(self) -> Array:

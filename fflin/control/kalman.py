@@ -19,7 +19,7 @@ from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
 from fflin.control.gain import Gain, ModelDesign
-from fflin.control.lqr import require_fixed_point
+from fflin.control.lqr import at_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
 from fflin.control.trajectory_end import steady_end
@@ -237,7 +237,7 @@ def kalman(
     >>> fflin.kalman(lin, noise, 1e-4, G=lin.B).L.shape
     (18, 18)
     """
-    require_fixed_point(lin)
+    lin = at_fixed_point(lin)
     noise, through = disturbance(lin, W, G)
     V = weight("V", V, lin.output_names, definite=True)
     noises = V

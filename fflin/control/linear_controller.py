@@ -23,6 +23,7 @@ from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedb
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
 from fflin.linear.fit import about_point, require_fit
+from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -126,7 +127,7 @@ class LinearController(Feedback):
     noise: Noise | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        lin = about_point(self.lin)
+        self.lin = lin = held_if_possible(about_point(self.lin))
         if number("sign", self.sign) not in (1.0, -1.0):
             raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
         if self.noise is not None and not callable(self.noise):
@@ -158,6 +159,11 @@ class LinearController(Feedback):
         self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
         self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Note on the momentum that wheels gain while they hold the robot at the point."""
+        return wheel_notes(self.lin)
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt

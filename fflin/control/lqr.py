@@ -27,6 +27,7 @@ from fflin.control.optimal.riccati import (
 )
 from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
 from fflin.dynamics.state import selection
+from fflin.linear.holding import held, is_held
 from fflin.linear.model import LinearModel
 
 # A relative residual above _COARSE gives a warning, and a residual above _USELESS raises an error.
@@ -82,7 +83,10 @@ def lqr(
     Parameters
     ----------
     lin : LinearModel
-        Model about a fixed point, or a model with ``moving=True`` about a steady motion.
+        Model about a point, or a model with ``moving=True`` about a steady motion. If the point is
+        not a fixed point, but inputs can hold the robot there at rest, the gain is designed with
+        the inputs of `equilibrium`, which are then its ``u0``. Wheels that hold the robot gain
+        momentum; the report of the gain states how much.
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight} with
         names of states or of their groups, such as ``q_b``. Unnamed states have zero weight.
@@ -110,7 +114,8 @@ def lqr(
     Raises
     ------
     EquilibriumError
-        If the operating point is not a fixed point; the message lists the nonzero entries of f0.
+        If the operating point is not a fixed point, and no inputs hold the robot there; the message
+        lists the nonzero entries of f0 and the forces that no input balances.
     StabilizabilityError
         If a mode neither decays by itself nor can be stabilised by the inputs; the message names
         the mode.
@@ -168,7 +173,7 @@ def regulator(
 
     Other designs contain such a gain as a part, for example as their terminal cost.
     """
-    require_fixed_point(lin)
+    lin = at_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, Pace(hold=lin.dt), wheel_speeds)
@@ -244,7 +249,7 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
     >>> gain.method, round(float(gain.poles.real.max()), 3)
     ('closed form', -0.707)
     """
-    require_fixed_point(lin)
+    lin = at_fixed_point(lin)
     if lin.dt:
         raise InputError(
             "lin is sampled, expected a continuous model; for a sampled regulator give the Q and R "
@@ -307,14 +312,32 @@ def _diagonal(
     return weight(what, diagonal, kept, definite=definite).diagonal()
 
 
-def require_fixed_point(lin: LinearModel) -> None:
-    """Raise `EquilibriumError` if the operating point of a model is not a fixed point.
+def at_fixed_point(lin: LinearModel) -> LinearModel:
+    """Return the model about a fixed point: `lin`, or the model with the inputs that hold it.
 
-    Raise `ModelError` if the robot's Pinocchio model was modified after the robot was created.
+    Wheels may accelerate at the point. Raise `EquilibriumError` if the point is not a fixed point
+    and no inputs hold the robot there. Raise `ModelError` if the robot's Pinocchio model was
+    modified after the robot was created.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
-    if lin.is_equilibrium():
-        return
+    if is_held(lin):
+        return lin
+    advice = (
+        "linearise about a fixed point, with the q and u of fflin.equilibrium (--equilibrium, in "
+        "orbit --relative-equilibrium), or about a steady motion with moving=True"
+    )
+    if lin.moving:
+        advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
+        if lin._robot is not None and any(lin._robot.gravity):
+            advice += "; in free fall, the errors move as without gravity: set gravity to zero"
+    elif not lin.v.any():
+        try:
+            holding = held(lin)
+        except EquilibriumError as error:
+            advice = str(error)
+        else:
+            if holding is not lin:
+                return holding
     rate = lin.rate
     # The message lists the largest rates first. Their magnitudes are rounded, because the last
     # digits differ between processors and would change the order of equal rates.
@@ -324,14 +347,6 @@ def require_fixed_point(lin: LinearModel) -> None:
         for i in np.argsort(-np.array(sizes), kind="stable")
         if lin.state_names[i] not in lin.ignorable and abs(rate[i]) > lin.bound(1e-9)
     ]
-    advice = (
-        "linearise about a fixed point, with the q and u of fflin.equilibrium (--equilibrium, in "
-        "orbit --relative-equilibrium), or about a steady motion with moving=True"
-    )
-    if lin.moving:
-        advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
-        if lin._robot is not None and any(lin._robot.gravity):
-            advice += "; in free fall, the errors move as without gravity: set gravity to zero"
     raise EquilibriumError(f"the point is not a fixed point: {listed(shown)}; {advice}")
 
 

@@ -15,7 +15,7 @@ from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, number, vector, whole
 from fflin.control.gain import Gain
-from fflin.control.lqr import regulator
+from fflin.control.lqr import at_fixed_point, regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
 from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
 from fflin.control.tracking import TrajectoryFeedback
@@ -257,6 +257,7 @@ def _unplanned(
 
 def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
     """Design the controller about a point; `ahead` is its horizon, which has no stages yet."""
+    lin = at_fixed_point(lin)
     (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = regulator(sampled, *given, weights=weights)

@@ -17,6 +17,7 @@ from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
+from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
@@ -75,7 +76,8 @@ class StateFeedback(Feedback):
     ----------
     lin : LinearModel
         Model that K was designed for. With a reduced model, only the states of the reduced model
-        are fed back.
+        are fed back. If its point is not a fixed point, but inputs can hold the robot there, u0 is
+        these inputs, as in `lqr`.
     K : array_like (nu, nx)
         Gain.
 
@@ -100,6 +102,12 @@ class StateFeedback(Feedback):
     def __post_init__(self) -> None:
         hint = " (nu, nx); give the gain that was designed for this model"
         self.K = frozen(shaped("K", self.K, about_point(self.lin).B.shape[::-1], hint))
+        self.lin = held_if_possible(self.lin)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Note on the momentum that wheels gain while they hold the robot at the point."""
+        return wheel_notes(self.lin)
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
@@ -375,5 +383,11 @@ def fed_back(policy: object) -> tuple[str, ...]:
     if schedule is not None:
         K = np.abs(schedule.K).max(axis=0)  # largest entries over time
     names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
-    used = np.ones(len(names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(compress(names, used))
+    if K is not None:
+        return tuple(compress(names, np.abs(K).max(axis=0, initial=0.0)))
+    system = getattr(decider(policy), "system", None)
+    if lin is None or system is None:
+        return names
+    # A controller of outputs feeds back the states that its outputs measure.
+    outputs = system.B.any(axis=0) | system.D.any(axis=0)
+    return tuple(compress(names, lin.C[outputs].any(axis=0)))

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.ranks import null_space
 from fflin.analysis.reduction import ignorable_wheels, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
@@ -17,6 +17,7 @@ from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import require_chart
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
 
@@ -91,6 +92,9 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     of_inputs = min(found) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
     sizes = numbers("largest", largest, "name", "largest value of")
+    for key, size in sizes.items():
+        if key.startswith("q_b"):
+            require_chart(f"largest value of '{key}'", size)
     values = {key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()}
     return _diagonal("largest", values, names, complete=of_inputs)
 
@@ -325,8 +329,9 @@ def _of_regulated(
         # The combinations of inputs in the null space of `forces` accelerate the wheels, but exert
         # no force on the robot without its wheels. X maps coordinates in this null space to the
         # accelerations of the wheels.
-        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
-        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels))
+        idle, _ = null_space(forces @ np.diag(1.0 / root))
+        X = S @ lin.B / root @ idle / (lin.dt or 1.0)
         Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
         rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
     return Q, R, rule, terms
@@ -345,6 +350,8 @@ def _weights_of(
             if of_robot and not stands_for_any(key, known):
                 continue  # a reduced model may lack states that the robot's weights name
             what, largest = f"largest value of '{key}' (--bryson)", part == "bryson"
+            if largest and key.startswith("q_b"):
+                require_chart(what, value)
             values[key] = inverse_square(what, value) if largest else value, key, largest
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}

@@ -33,7 +33,8 @@ class Equilibrium(FrozenArrays):
     ----------
     q : ndarray (nq,)
         Equilibrium configuration, to be given to `linearize` as q. This configuration differs from
-        the given configuration by the spring deflections of joints without a motor.
+        the given configuration by the spring deflections of joints without a motor. In orbit, the
+        base may be displaced, see `equilibrium`.
     u : ndarray (nu,)
         Minimum-norm inputs, to be given to `linearize` as u.
     sag : ndarray (n,)
@@ -101,7 +102,15 @@ def equilibrium(
 
     The norm of u is the norm of its numerical values in SI units. The force balance has rows in N m
     and in N. To make these rows comparable, row i is scaled by :math:`\sqrt{(M^{-1})_{ii}}`, with
-    the inertia matrix M. The scaled residual must not exceed 1e-9 of the balanced forces.
+    the inertia matrix M. The scaled residual must not exceed 1e-9 of the balanced forces, or its
+    accelerations must be so small that `LinearModel.is_equilibrium` counts them as zero.
+
+    If no inputs balance all forces, but the robot has reaction wheels, the wheels may accelerate:
+    only the forces on the other coordinates are balanced. The wheels then gain momentum.
+
+    In orbit, a base at the origin of the orbital frame needs a force if its origin is not the
+    centre of mass. If no input pushes the base, it is displaced so that the centre of mass is on
+    the orbit.
 
     A joint with a spring but without a `JointTorque` deflects, unless another input balances the
     force on the joint. Newton's method finds the deflected position. Its Jacobian is
@@ -164,10 +173,71 @@ def equilibrium(
         linearizer = Linearizer(robot, frame=frame, reference=own)
     else:
         linearizer = Linearizer(robot, moving=True)
-    actuation, pushes = Actuation(state), forces_of(robot)
-    free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
+    balance = first = _settled(linearizer, state, given, v, spun=False)
+    attempts = [(given, True)] * bool(first.lin.wheels)
+    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
+        centered = on_orbit(robot, given, state.frame)
+        attempts += [(centered, False), *[(centered, True)] * bool(first.lin.wheels)]
+    for at, spun in attempts:
+        if balance.holds:
+            break
+        balance = _settled(linearizer, state, at, v, spun=spun)
+    balance = balance if balance.holds else first
+    pushes = forces_of(robot)
+    if not balance.holds:
+        sizes, named = np.abs(balance.left), list(pushes.items())
+        forces = [
+            f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
+            for i in np.argsort(-sizes)  # the largest scaled force first
+            if sizes[i] > 1e-6 * sizes.max()
+        ]
+        advice = "add inputs that balance these forces (thrusters cannot pull)"
+        if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
+            advice += ", set gravity to zero if the robot falls freely"
+        raise EquilibriumError(
+            f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
+            f"forces: {listed(forces)}; {advice}, or choose another point"
+        )
+    at, u, actuation = balance.lin.q, balance.u, Actuation(state)
+    if reference is not None or robot.orbit:
+        base = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(at[:7])
+        R = state.reference.rotation.T @ base.rotation
+        for columns in actuation.held:
+            u[columns] = R @ u[columns]
+    names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
+    return Equilibrium(at, u, state.joints_apart(given, at), balance.residual, *names)
+
+
+def _pushed(linearizer: Linearizer) -> bool:
+    """Return whether a robot has inputs that exert a force on the base."""
+    return not {"F_b", "thrust"}.isdisjoint(linearizer.prepared.actuation.groups)
+
+
+def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
+    """Return q (nq,) with the base displaced so that the centre of mass is on the orbit.
+
+    The base is displaced in the plane that is perpendicular to the orbit.
+    """
+    placed, root = q.copy(), robot.model.jointPlacements[ROOT]
+    along = OrbitField(robot, frame).axes[:, 1]
+    center = pin.centerOfMass(robot.model, robot.create_data(), q)
+    placed[:3] -= root.rotation.T @ (center - (center @ along) * along)
+    return placed
+
+
+def _settled(
+    linearizer: Linearizer, state: StateMap, given: Array, v: Array | None, *, spun: bool
+) -> _Balance:
+    """Return the balance after joints with a spring but without a motor have deflected.
+
+    If `spun`, the inputs may accelerate the wheels of the robot, so that the wheels gain momentum.
+    """
+    robot = linearizer.robot
+    pushes, motors = forces_of(robot), set(Actuation(state).names)
+    free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - motors
     soft = np.array([name in free for name in pushes])
-    tolerance = (balance := _Balance(linearizer, given, v)).tolerance
+    balance = _Balance(linearizer, given, v, spun=spun)
+    tolerance = balance.tolerance
     for _ in range(20):  # Newton's method, which needs a few steps
         loose = soft & (np.abs(balance.residual) > tolerance)
         if not loose.any():
@@ -184,46 +254,30 @@ def equilibrium(
         step[soft] = np.linalg.solve(hold, balance.residual[soft])
         at = pin.integrate(robot.model, lin.q, state.spread(step))
         at[:7] = given[:7]
-        balance = _Balance(linearizer, at, v)
+        balance = _Balance(linearizer, at, v, spun=spun)
         tolerance = np.maximum(tolerance, balance.tolerance)
-    left = np.where(soft & ~loose, 0.0, balance.left)
-    if float(np.linalg.norm(left)) > balance.allowed:
-        sizes, named = np.abs(left), list(pushes.items())
-        forces = [
-            f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
-            for i in np.argsort(-sizes)  # the largest scaled force first
-            if sizes[i] > 1e-6 * sizes.max()
-        ]
-        advice = "add inputs that balance these forces (thrusters cannot pull)"
-        if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
-            advice += ", set gravity to zero if the robot falls freely"
-        raise EquilibriumError(
-            f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-            f"forces: {listed(forces)}; {advice}, or choose another point"
-        )
-    at, u = balance.lin.q, balance.u
-    if reference is not None or robot.orbit:
-        chart = state.chart(at)
-        for columns in actuation.held:
-            u[columns] = chart.R @ u[columns]
-    names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
-    return Equilibrium(at, u, state.joints_apart(given, at), balance.residual, *names)
+    balance.left[soft & ~loose] = 0.0
+    return balance
 
 
 class _Balance:
     """Minimum-norm inputs that balance the forces at a point, and the residual forces.
 
-    Inputs and forces on the base are in base axes.
+    Inputs and forces on the base are in base axes. If `spun`, the wheels may accelerate. The rows
+    of their forces are then zero, and their inertial forces are taken out of all other rows.
     """
 
-    def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
+    def __init__(
+        self, linearizer: Linearizer, q: Array, v: Array | None, *, spun: bool = False
+    ) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
         self.lin = lin = linearizer(q, v)
         drift = lin.rate
         _require_steady(lin, drift)
         columns = actuation.columns(robot.create_data(), lin.q)
         M, acceleration = lin.M, drift[-len(lin.M) :]
-        mobility = np.sqrt(np.linalg.inv(M).diagonal())
+        inverse = np.linalg.inv(M)
+        mobility = np.sqrt(inverse.diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
         # Compute bounds (6 + n,) of the rounding errors in the forces, because large terms may
         # cancel in the forces.
@@ -235,12 +289,45 @@ class _Balance:
         rounding[6:] += springs.stiffness * farthest
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
         wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
+        if spun:
+            wheels = np.array([6 + robot.joint_names.index(name) for name in lin.wheels])
+            others = _without_wheels(M, wheels)
+            columns, wanted = others @ columns, others @ wanted
+            terms, rounding = np.abs(others) @ terms, np.abs(others) @ rounding
         thrusts: Indices | list[int] = actuation.groups.get("thrust", [])
         target = mobility * wanted
         self.u, self.left = least_norm(mobility[:, None] * columns, target, thrusts)
-        self.allowed = TOLERANCE * float(np.linalg.norm(target))
-        self.allowed += float(np.linalg.norm(mobility * rounding))
         self.residual, self.tolerance = self.left / mobility, rounding + terms
+        self._allowed = TOLERANCE * float(np.linalg.norm(target))
+        self._allowed += float(np.linalg.norm(mobility * rounding))
+        self._to_rates = inverse / mobility
+        if spun:
+            self._to_rates[wheels] = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the inputs balance the forces.
+
+        The residual forces must be rounding errors, or so small that their accelerations count as
+        zero in `LinearModel.is_equilibrium`.
+        """
+        rates = np.abs(self._to_rates @ self.left).max(initial=0.0)
+        small = float(np.linalg.norm(self.left)) <= self._allowed
+        return small or bool(rates <= self.lin.bound(TOLERANCE))
+
+
+def _without_wheels(M: Array, wheels: Indices) -> Array:
+    """Return the matrix (nv, nv) that maps forces to forces on the robot with free wheels.
+
+    By the equation of motion, a free wheel takes the acceleration that its torque and the other
+    accelerations give it. Its inertial force then acts on the other coordinates.
+    """
+    others = np.setdiff1d(np.arange(len(M)), wheels)
+    result = np.zeros_like(M)
+    result[others, others] = 1.0
+    across = np.linalg.solve(M[np.ix_(wheels, wheels)], M[np.ix_(wheels, others)])
+    result[np.ix_(others, wheels)] = -across.T
+    return result
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:

@@ -102,16 +102,34 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
     return found
 
 
+def require_chart(what: str, size: float) -> None:
+    """Raise `InputError` if a value of q_b, the vector part of a unit quaternion, exceeds 1."""
+    if size > 1.0:
+        raise InputError(
+            f"{what} is {size:g}, expected at most 1, because q_b is the vector part of a "
+            "quaternion: a rotation by x rad has |q_b| = sin(x / 2), so 5 deg is 0.0436"
+        )
+
+
+def _bound(what: str, value: object) -> float:
+    """Return one side of a limit, which may be infinite: the signal is then free on this side."""
+    if isinstance(value, float | np.floating) and math.isinf(value):
+        return float(value)
+    return number(what, value)
+
+
 def range_of(name: str, value: object) -> Range:
     """Return a limit as (least, largest); one number x stands for (-x, x)."""
     what = f"limit of '{name}'"
     bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
     if len(bounds) == 2:
-        least, largest = (number(what, x) for x in bounds)
+        least, largest = (_bound(what, x) for x in bounds)
     else:
         largest = number(what, value)
         least = -largest
-    if least > largest:
+    if name.startswith("q_b") and math.isfinite(size := max(abs(least), abs(largest))):
+        require_chart(what, size)
+    if not least <= largest or least == math.inf or largest == -math.inf:
         raise InputError(
             f"{what} is {value}, expected a largest magnitude of at least 0, or bounds (least, "
             "largest)"
@@ -149,6 +167,8 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
         weights[part] = numbers(part, given.get(part, {}), "name", f"{part} of")
         for key, entry in weights[part].items():
             matching(kind, key, names)
+            if part == "bryson" and key.startswith("q_b"):
+                require_chart(f"bryson of '{key}'", entry)
             if entry < 0.0 or (part != "q" and not entry):
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
@@ -273,11 +293,11 @@ def chosen_limits(
     flown as wheels. By default, these are the wheels of the robot.
 
     `limits` is None, "urdf", one limit for all inputs, limits by name, or a list of these that
-    contains "urdf". The text "urdf" selects all limits of the robot. A limit given in `limits`
-    replaces the robot's limit of the same input or state.
+    contains "urdf" or mappings. The text "urdf" selects all limits of the robot. A limit given in
+    `limits` replaces the robot's limit of the same input or state.
     """
     own, given = dict[str, Range](), dict[str, Range]()
-    several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
+    several = isinstance(limits, list | tuple) and any(isinstance(x, str | Mapping) for x in limits)
     for part in limits if isinstance(limits, list | tuple) and several else [limits]:
         if isinstance(part, str):
             if part != "urdf":

@@ -159,6 +159,8 @@ class Thruster(Input):
         Reaction torque [N m] on the link for each newton of force, about the direction of the
         force; zero by default. For a propeller this is the drag torque, which is opposite to the
         rotation: it is negative for a propeller that turns by the right-hand rule about the force.
+    isp : float, optional
+        Specific impulse [s], with which the report of a simulation computes the propellant.
 
     Examples
     --------
@@ -179,9 +181,12 @@ class Thruster(Input):
     on_off: bool = field(default=False, kw_only=True, repr=False)
     least_impulse: float | None = field(default=None, kw_only=True, repr=False)
     torque: float = field(default=0.0, kw_only=True, repr=False)
+    isp: float | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.isp is not None:
+            self._set("isp", positive("thruster isp", self.isp, "s"))
         pulses = truth("thruster on_off", self.on_off)
         if self.ranges[0][0] < 0.0 or (pulses and (self.max is None or self.min)):
             raise InputError(

@@ -324,7 +324,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     ``thruster``        `Thruster`       ``frame``, ``position`` [m] and
                                          ``direction``; optional: ``name``,
                                          ``on_off``, ``least_impulse`` [N s],
-                                         ``torque`` [N m per N]
+                                         ``torque`` [N m per N],
+                                         ``isp`` [s]
     ``reaction_wheel``  `ReactionWheel`  ``axis``; optional: ``frame``, ``name``,
                                          and either ``inertia`` [kg m^2] with
                                          ``max_speed`` [rad/s], or ``momentum``

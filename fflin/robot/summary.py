@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.fields import limits_of, travel_of
+from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -26,6 +27,10 @@ _LOOKS = {
 # Frequency [rad/s] and damping ratio of the springs and dampers that a draft suggests for joints
 # without a motor.
 _SWING, _DAMPED = math.pi, 0.01
+
+# Inertia [kg m^2], torque [N m] and largest speed [rad/s] of a small reaction wheel, which a draft
+# suggests if the URDF does not give them.
+_ROTOR, _MOTOR, _SPEED = 1e-3, 0.1, 600.0
 
 
 def robot_info(robot: Robot, at_point: str = "") -> str:
@@ -185,17 +190,22 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
         name, key = _text(frame.name), "direction"
         if kind == "reaction_wheel":
             # The name of a wheel must differ from the names of all joints and frames.
-            name, key, lines = _text(f"{frame.name}_rotor"), "axis", ["max = 1.0  # [N m]"]
+            name, key = _text(f"{frame.name}_rotor"), "axis"
             joint = model.joints[frame.parentJoint]
             if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
                 axis = np.asarray(data.joints[frame.parentJoint].S).reshape(6)[3:]
                 size = axis @ model.inertias[frame.parentJoint].inertia @ axis
                 spun.append(_text(model.names[frame.parentJoint]))
                 lock = f"# To use this wheel, lock joint {spun[-1]} above.\n"
-                limits = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
-                effort, speed = (f"{x:.6g}" if 0.0 < x < 1e100 else "1.0" for x in limits)
-                lines = [f"inertia = {size:.6g}  # [kg m^2]", f"max = {effort}  # [N m]"]
-                lines.append(f"max_speed = {speed}  # [rad/s]")
+                effort, speed = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
+            else:
+                size = axis @ frame.inertia.inertia @ axis
+                effort = speed = 0.0
+            lines = [
+                _guessed("inertia", size, _ROTOR, "[kg m^2]"),
+                _guessed("max", effort, _MOTOR, "[N m]"),
+                _guessed("max_speed", speed, _SPEED, "[rad/s]"),
+            ]
         placed = data.oMf[index]
         said = (
             f"# Link {_text(frame.name)} at {_vector(placed.translation)} [m], {key} "
@@ -207,6 +217,26 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
         text += f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
         text += "".join(f"# {line}\n" for line in lines)
     return text, spun
+
+
+def _guessed(key: str, value: float, guess: float, unit: str) -> str:
+    """Return a line of TOML with a value, or with a guess if the URDF gives no finite value."""
+    if 0.0 < value < 1e100:
+        return f"{key} = {value:.6g}  # {unit}"
+    return f"{key} = {guess:g}  # {unit}; a guess"
+
+
+def ideal_inputs(robot: Robot) -> str:
+    """Return a remark on the inputs of a robot that no actuator has, or ""."""
+    ideal = [x for x in robot.inputs if isinstance(x, BaseTorque | BaseForce)]
+    if not ideal:
+        return ""
+    kinds = " and ".join("torque" if isinstance(x, BaseTorque) else "force" for x in ideal)
+    limits = "" if all(x.max is not None for x in ideal) else " without limits"
+    return (
+        f"an ideal {kinds}{limits} on the base stands for its actuators; for thrusters or wheels, "
+        "give the robot file [[input]] tables, or the option --inputs a file"
+    )
 
 
 def _vector(values: np.ndarray) -> str:

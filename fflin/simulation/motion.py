@@ -25,7 +25,15 @@ from fflin.linear.trajectory import Trajectory, along
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
-from fflin.simulation.report import Passed, Saturated, curves, motion_report, passed, saturated
+from fflin.simulation.report import (
+    Passed,
+    Saturated,
+    curves,
+    motion_report,
+    passed,
+    pulse_thrusters,
+    saturated,
+)
 
 FORMATS = (*RECORDS, ".csv")
 
@@ -319,7 +327,7 @@ class Motion(StatesAndInputs, Design):
     @property
     def saturated(self) -> tuple[Saturated, ...]:
         """Inputs and wheel speeds that saturated, sorted by time in saturation, longest first."""
-        return saturated(self.t, curves(self))
+        return saturated(self.t, curves(self), pulse_thrusters(self))
 
     def save(self, path: str | Path) -> None:
         """Save the motion to a .npz, .mat, .json or .csv file, atomically.

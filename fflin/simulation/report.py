@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from textwrap import shorten
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,6 +14,7 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.impact import Impact
+from fflin.robot.inputs import Thruster
 
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
@@ -30,9 +31,18 @@ THERE, _NOTHING = 1e-9, 1e-14
 # length of this part, as a fraction of all rows.
 DWELL = 0.05
 
+# The end of a run decides whether an error decays. The largest error in the last _TAIL of all rows
+# is compared with the largest error in as many rows before: an error grows or decays if it changes
+# by the factor _GROWS. An error that returns below its earlier values oscillates and does not grow.
+# An error below _SEEN times its largest value is not judged.
+_TAIL, _GROWS, _SEEN = 0.1, 1.05, 1e-3
+
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3
+
+# Standard gravity [m/s^2], which relates the specific impulse of a thruster to its exhaust speed.
+_GRAVITY = 9.80665
 
 _MOST, _NAMED = 8, 4  # largest number of lines of a list, and of saturated inputs in a line
 
@@ -164,20 +174,83 @@ def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
     return tuple(one for _, one in sorted(worst))
 
 
-def saturated(t: Array, found: Iterable[Curve]) -> tuple[Saturated, ...]:
-    """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first."""
+def saturated(
+    t: Array, found: Iterable[Curve], pulsed: Collection[str] = ()
+) -> tuple[Saturated, ...]:
+    """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first.
+
+    The inputs in `pulsed` are thrusters that are off or on, so a pulse at the limit is no
+    saturation.
+    """
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
     for curve in found:
         # Inputs are clipped exactly at their limits. Wheel speeds only approach their limits, and
         # therefore need a larger margin.
         margin = 1e-3 if curve.group == "speed" else 1e-9
-        enforced = curve.group not in (*STATES, "momentum")
+        enforced = curve.group not in (*STATES, "momentum") and curve.name not in pulsed
         for limit in curve.levels if enforced else ():
             spent = held[np.abs(curve.values - limit) <= margin * abs(limit)]
             if limit and spent.any():
                 share = float(spent.sum() / held.sum())
                 full.append(Saturated(curve.name, limit, curve.unit, share))
     return tuple(sorted(full, key=lambda each: -each.share))
+
+
+class Firings(NamedTuple):
+    """Use of the thrusters in a motion; `pulses` is None if not every step is recorded."""
+
+    pulses: int | None
+    impulse: float  # [N s], sum of all thrusters
+    propellant: float | None  # [kg]; None if a thruster that fires has no specific impulse
+
+    def __str__(self) -> str:
+        said = f"thrusters: impulse {_shown(self.impulse)} N s"
+        if self.pulses:
+            said += f" in {self.pulses} pulses"
+        if self.propellant is not None:
+            said += f", propellant {_shown(self.propellant)} kg"
+        return said
+
+
+def firings(motion: Motion) -> Firings | None:
+    """Return the pulses, impulse and propellant of the thrusters, or None without thrusters.
+
+    Inputs are constant from one row to the next, so the impulse is exact if every step is recorded.
+    """
+    keys = input_keys(motion)
+    at = [i for i, key in enumerate(keys) if group_of(key) == "thrust"]
+    if not at:
+        return None
+    held = np.diff(motion.t)
+    thrusts = motion.u[:-1, at]
+    impulses = held @ thrusts
+    thrusters = thrusters_of(motion)
+    names = [motion.input_names[i] for i in at]
+    pulsed = [
+        x in thrusters and bool(thrusters[x].on_off or thrusters[x].least_impulse) for x in names
+    ]
+    on = thrusts[:, pulsed] > 0.0
+    starts = np.count_nonzero(on[1:] & ~on[:-1]) + np.count_nonzero(on[:1])
+    every = not motion.step or bool((held <= 1.5 * motion.step).all())
+    exhaust = [_GRAVITY * (thrusters[x].isp or 0.0) if x in thrusters else 0.0 for x in names]
+    fired = impulses > 0.0
+    speeds = np.array(exhaust)[fired]
+    propellant = float((impulses[fired] / speeds).sum()) if len(speeds) and speeds.all() else None
+    pulses = int(starts) if every and any(pulsed) else None
+    return Firings(pulses, float(impulses.sum()), propellant)
+
+
+def thrusters_of(motion: Motion) -> dict[str, Thruster]:
+    """Return the thrusters of a motion by their names; empty if its robot is not known."""
+    if motion._robot is None:
+        return {}
+    inputs = motion._robot.named_inputs
+    return {names[0]: item for item, names in inputs if isinstance(item, Thruster)}
+
+
+def pulse_thrusters(motion: Motion) -> frozenset[str]:
+    """Return the names of the thrusters that are off or on; empty if the robot is not known."""
+    return frozenset(name for name, thruster in thrusters_of(motion).items() if thruster.on_off)
 
 
 def _name(name: str) -> str:
@@ -218,6 +291,7 @@ class ErrorSize(NamedTuple):
     final: float
     settled: float | None  # time [s] from which the error is settled; None if too late or never
     steered: bool  # whether the policy feeds the error back
+    tail: str = ""  # "remains" or "grows" at the end of the run; empty if the error decays
 
     @property
     def last(self) -> str:
@@ -264,8 +338,22 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
         fed_back &= title not in ("position", "v_b") or pushed(motion)
         at = int(settled_at(size))
         settled = None if is_late(at, len(size)) else motion.t[at]
-        found.append(ErrorSize(title, unit, size[0], size.max(), size[-1], settled, fed_back))
+        sizes_of_kind = size[0], size.max(), size[-1]
+        found.append(ErrorSize(title, unit, *sizes_of_kind, settled, fed_back, _tail(size)))
     return found
+
+
+def _tail(size: Array) -> str:
+    """Return whether an error (N,) remains or grows in the last rows of a run, or ""."""
+    # The last two windows are compared by their largest errors, so that an oscillation about a
+    # constant error counts as one that remains.
+    rows = max(int(_TAIL * len(size)), 1)
+    last, before = size[-rows:], size[-2 * rows : -rows].max(initial=0.0)
+    if last.max() <= max(_SEEN * size.max(), THERE):
+        return ""
+    if last.max() > _GROWS * before and last.min() >= before:
+        return "grows"
+    return "remains" if last.max() * _GROWS > before else ""
 
 
 def pushed(of: object) -> bool:
@@ -297,6 +385,8 @@ def motion_report(motion: Motion) -> str:
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
     said = [*(f"limit exceeded: {each}" for each in motion.passed), *map(str, motion.saturated)]
+    if fired := firings(motion):
+        parts.append(folded([str(fired)]))
     if said:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
@@ -336,6 +426,7 @@ def motion_record(motion: Motion) -> dict[str, object]:
         "errors": dict(zip(keys, errors, strict=True)),
         "x": motion.x[-1],
         "largest_inputs": np.abs(motion.u).max(axis=0),
+        "thrusters": firings(motion),
         "limits_exceeded": motion.passed,
         "energy": motion.energy[[0, -1]],
         "momentum_drift": motion.momentum_drift.max(),
@@ -386,10 +477,14 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
         said = f"not settled: {_and(failed)} off target"
     elif moved:
         when = max(kind.settled or 0.0 for kind in moved)
-        said = f"settled after {when:.3g}\u00a0s to within {100.0 * SETTLED:g}\u00a0%"
+        band = [f"{SETTLED * kind.largest:.2g}\u00a0{kind.unit} ({kind.title})" for kind in moved]
+        said = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
         if late := [kind.last for kind in kinds if kind.settled is None and kind.steered]:
             what = "positions" if judged[0].title in _PLACES else "rates"
             said = f"{what} {said}; not yet settled: {_and(late)}"
+        for tail, what in (("remains", "remaining"), ("grows", "drifting")):
+            if left := [kind.last for kind in moved if kind.tail == tail]:
+                said += f"; {what}: {_and(left)}"
     else:
         which = f"{_and([kind.title for kind in judged])} " * bool(aside)
         said = f"settled: {which}at the target throughout the run"

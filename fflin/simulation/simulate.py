@@ -142,7 +142,9 @@ def simulate(
         - a number: the largest magnitude of every input;
         - a mapping {input, group or pattern: magnitude, or (lower, upper)};
         - a list in which explicit limits take precedence over "urdf", such as
-          ``["urdf", {"tau_m": 5.0}]``.
+          ``["urdf", {"tau_m": 5.0}]``, and later mappings over earlier ones.
+
+        One side of a limit may be infinite.
 
         On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
     disturbance : callable, optional
@@ -260,7 +262,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     if foresees is not None and beyond is None:
         prediction = predict(plan, foresees, x, run.steps)
     energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
-    bound = plan.law and plan.law.policy
+    policies = plan.policy, plan.law and plan.law.policy
     limits = limits_of(plan.options.robot) | plan.acting
     missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
     drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
@@ -300,7 +302,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
             *growing(plan.policy),
             *plan.times.notes,
             *_energy_note(plan, run, energy, float(scale[0])),
-            *getattr(bound, "notes", ()),
+            *dict.fromkeys(note for each in policies for note in getattr(each, "notes", ())),
             *half_turn_notes(plan, beyond, predicted=foresees is not None),
         ),
         limit_names=tuple(limits),

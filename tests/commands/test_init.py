@@ -263,3 +263,36 @@ def test_lqr_on_the_command_line_weighs_what_the_file_says(sat):
     assert says(weights(), "tau_b", "identity")
     assert says(weights("--q", "q_b=3"), "tau_b, q_b", "identity")
     assert says(weights("--weights", "urdf"), "URDF")
+
+
+WHEEL = """<robot name="bus"><link name="bus"><inertial><mass value="50"/>
+<inertia ixx="5" ixy="0" ixz="0" iyy="6" iyz="0" izz="7"/></inertial></link>
+<link name="wheel_x"><inertial><mass value="1"/>
+<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.002"/></inertial></link>
+<joint name="spin" type="{kind}"><parent link="bus"/><child link="wheel_x"/><axis xyz="0 0 1"/>
+<limit effort="0.1" velocity="{speed}"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "speed", "inertia", "most"),
+    [("fixed", 0, 0.001, 600.0), ("continuous", 0, 0.002, 600.0), ("continuous", 50, 0.002, 50.0)],
+)
+def test_suggested_wheels_have_an_inertia_and_saturate(tmp_path, kind, speed, inertia, most):
+    (tmp_path / "bus.urdf").write_text(WHEEL.format(kind=kind, speed=speed))
+    assert run("init", tmp_path / "bus.urdf", cwd=tmp_path)[0] == 0
+    text = (tmp_path / "bus.toml").read_text()
+    start = text.index('# [[input]]\n# type = "reaction_wheel"')
+    table = text[start:].split("\n\n")[0].replace("# ", "", 1).replace("\n# ", "\n")
+    lock = 'lock = ["spin"]\n' if kind == "continuous" else ""
+    (tmp_path / "flown.toml").write_text(f'urdf = "bus.urdf"\n{lock}{table}\n')
+    robot = fflin.load(tmp_path / "flown.toml")
+    (wheel,) = robot.inputs
+    assert wheel.inertia == pytest.approx(inertia) and wheel.max and wheel.max_speed == most
+
+
+def test_an_ideal_force_on_the_base_is_said_to_be_ideal(tmp_path):
+    (tmp_path / "bus.urdf").write_text(WHEEL.format(kind="fixed", speed=0))
+    assert says(run("init", tmp_path / "bus.urdf", cwd=tmp_path)[1], "ideal torque and force")
+    assert says(run("info", tmp_path / "bus.toml")[1], "warning: an ideal torque and force without")
+    jets = run("info", "cubesat", "--inputs", "cubesat")[1]
+    assert "ideal" not in jets

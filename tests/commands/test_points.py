@@ -1,5 +1,7 @@
 """Operating point, target and start of a robot file, as the commands use them."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -136,3 +138,18 @@ def test_uncertain_is_about_the_point_at_rest(sat):
     robot = fflin.load(path)
     lft = fflin.uncertain(robot, {"base.mass": 0.1}).lft(pose(robot, 30, joint_2=0.6, joint_4=-0.8))
     np.testing.assert_allclose(fflin.LFT.load(sat / "u.npz").A, lft.A, atol=1e-14)
+
+
+def test_none_removes_the_orbit_of_a_file_and_the_regulator_holds_in_it(tmp_path):
+    """The base torque holds the gravity gradient at the default point, without any option."""
+    path = tmp_path / "arm.toml"
+    path.write_text('urdf = "servicer_7dof"\norbit = 550e3\n[start]\nrpy = [1, 0, 0]\n')
+    for option, orbit in (((), True), (("--orbit", "none"), False)):
+        code, out, _ = run("simulate", path, "--duration", "2", *option, "--json")
+        assert code == 0 and (json.loads(out)["frame"] == "lvlh") is orbit
+    design = json.loads(run("lqr", path, "--json")[1])
+    assert np.abs(design["u0"]).max() > 1e-9
+    robot = fflin.load(path)
+    held = fflin.equilibrium(robot)
+    assert design["u0"] == pytest.approx(held.u, rel=1e-9, abs=1e-15)
+    assert "'no' is not a number" in refused("lqr", path, "--orbit", "no")

@@ -120,6 +120,15 @@ def test_a_position_that_no_input_pushes_is_estimated_if_it_can_be():
     assert fflin.lqg(gain, by_torque).poles.real.max() < 0.0
 
 
+@pytest.mark.parametrize("name", ["ets_vii", "canadarm2", "servicer_7dof"])
+def test_all_momenta_that_no_noise_excites_are_named(name):
+    """Noise of the joint torques alone changes none of the six momenta of the robot."""
+    lin = fflin.linearize(fflin.load(name))
+    base = ", ".join(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz")
+    with pytest.raises(fflin.InputError, match=f"W does not excite {base}, whose"):
+        fflin.kalman(lin, {"tau_m": 1e-6}, 1e-4, G=lin.B)
+
+
 def test_parts_of_different_models_are_refused(lin):
     gain = fflin.lqr(lin, 1, 1)
     with pytest.raises(fflin.InputError, match="models"):

@@ -250,10 +250,47 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     loose = panels(damping=0.0).replace(stiffness={})
     with pytest.raises(fflin.StabilizabilityError, match=r"momentum of h1.*--stiffness.*--reduce"):
         fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
+    with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h\*"\], --lock'):
+        fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
+    one = [*base, fflin.JointTorque("h2")]
+    with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h1"\], --lock'):
+        fflin.lqr(fflin.linearize(loose.replace(inputs=one)), 1.0, 1.0)
     hub = fflin.load("cubesat", inputs=[fflin.BaseForce()])
     with pytest.raises(fflin.StabilizabilityError, match=r"angular momentum.*--reduce") as told:
         fflin.lqr(fflin.linearize(hub))
     assert "spring" not in str(told.value)
+
+
+def test_a_largest_q_b_beyond_a_quaternion_is_refused(lin):
+    """Degrees or radians for q_b, whose magnitude is the sine of half the angle."""
+    robot = fflin.load("ets_vii")
+    for refused in (
+        lambda: fflin.bryson(lin, {"q_b": 5.0}),
+        lambda: fflin.lqr(lin, weights={"bryson": {"q_b.x": 5.0}}),
+        lambda: robot.replace(weights={"bryson": {"q_b": 1.5}}),
+        lambda: robot.replace(limits={"q_b": 30.0}),
+    ):
+        with pytest.raises(fflin.InputError, match=r"at most 1.*sin\(x / 2\)"):
+            refused()
+    assert fflin.bryson(lin, {"q_b": 1.0})[0] == 1.0
+
+
+def test_limits_may_be_lists_of_mappings_and_open_on_one_side(lin, gain):
+    robot, policy = fflin.load("ets_vii"), fflin.StateFeedback(lin, gain.K)
+    x0 = np.zeros(24)
+    x0[0] = 0.2
+
+    def largest(limits):
+        motion = fflin.simulate(robot, policy, x0=x0, duration=0.05, limits=limits)
+        return motion.u[:, 0].min(), motion.u[:, 0].max()
+
+    free = largest(None)
+    assert free[0] < -1.0
+    assert largest({"tau_b": (-1.0, np.inf)})[0] == -1.0
+    assert largest({"tau_b": (-np.inf, 1.0)}) == free
+    assert largest([{"tau_b": 1.0}, {"tau_b.x": 0.5}])[0] == -0.5
+    with pytest.raises(fflin.InputError, match=r"tau_b"):
+        largest({"tau_b": (np.inf, np.inf)})
 
 
 def test_springs_do_not_hide_that_momentum_is_conserved():
@@ -432,8 +469,10 @@ def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("dt", [0.02, 3.0])
 def test_a_sampled_point_is_refused_with_the_rates_of_the_robot(moving, dt):
-    # Every body falls at g. A sample of A and f0 also moves the position, but the robot is at rest.
+    # Every body falls at g, and the joints cannot hold the base. A sample of A and f0 also moves
+    # the position, but the robot is at rest.
     robot = fflin.load("planar_detumble", gravity=(0.0, 0.0, -9.81))
+    robot = robot.replace(inputs=[fflin.JointTorque("*")])
     lin = fflin.linearize(robot, moving=moving)
     stated = "not a fixed point: d v_b.z/dt = -9.81; "
     designs = (

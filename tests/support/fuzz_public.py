@@ -198,7 +198,7 @@ def light(folder):
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
-            **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
+            **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1, "isp": 220.0},
             "torque": 0.02,
         },
         "Trajectory": knots | {"robot": robot, "hold": None, "frame": "local"},
