@@ -37,8 +37,9 @@ _MOTION = 1e-2
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
-    "or springs, damping or gravity that differ from the robot"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, quaternions that are not in the order "
+    "x, y, z, w, knots of a coarse or semi-implicit Euler integration, wrong units of t or of the "
+    "joints, or springs, damping or gravity that differ from the robot"
 )
 
 # The integration over an interval is repeated with halved steps. The repetition ends if the state
@@ -223,6 +224,10 @@ class Trajectory(Design):
         """
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
+
+    def accelerations(self) -> Array:
+        """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
+        return self._aba.accelerations(self.q, self.v, self.u_base)
 
     def resampled(self, dt: float) -> Trajectory:
         """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
