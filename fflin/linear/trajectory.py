@@ -15,7 +15,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
-from fflin.base.tables import folded
+from fflin.base.tables import data_frame, folded
 from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
@@ -26,6 +26,8 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from fflin import Motion
     from fflin.base.validation import Array, Indices, Vector
 
@@ -305,6 +307,21 @@ class Trajectory(Design):
         else:
             record = record_of(self) | {"input_names": list(self.actuation.names)}
             write_record(target, record, checksummed=self.verified)
+
+    def to_pandas(self) -> DataFrame:
+        """Return t, q, v and u as a pandas data frame, with the times as its index.
+
+        The columns are those of the .csv file that `save` writes.
+
+        Raises
+        ------
+        MissingPackageError
+            If pandas is not installed.
+        """
+        from fflin.linear.files import trajectory_columns
+
+        rows = np.column_stack((self.t, self.q, self.v, self.u))
+        return data_frame(trajectory_columns(self), rows, index="t")
 
     @staticmethod
     def load(  # type: ignore[override]
