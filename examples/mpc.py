@@ -10,7 +10,7 @@ robot = fflin.load("servicer_7dof")
 lin = fflin.linearize(robot)
 Q = fflin.bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})
 R = fflin.bryson(lin, {"tau_b": 20.0, "F_b": 20.0, "tau_m": 5.0})
-policy = fflin.mpc(lin, Q, R, horizon=20, dt=0.25, limits=limits)
+policy = fflin.mpc(lin, Q, R, horizon=20, sample=0.25, limits=limits)
 
 base = pin.SE3(pin.rpy.rpyToMatrix(np.radians(60.0), 0.0, 0.0), np.zeros(3))
 q0 = fflin.configuration(robot, base=base)

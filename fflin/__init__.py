@@ -34,6 +34,7 @@ _PUBLIC = {
         "linear.trajectory": "Trajectory",
         "linear.linear_trajectory": "linearize_trajectory LinearTrajectory",
         "linear.exchange": "transform from_tool ToolModel ToolGain",
+        "linear.tool_trajectory": "ToolTrajectory ToolSchedule",
         "linear.check": "check Check",
     },
     "Analysis": {

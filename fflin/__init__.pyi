@@ -55,6 +55,8 @@ from fflin.linear.exchange import transform as transform
 from fflin.linear.exchange import from_tool as from_tool
 from fflin.linear.exchange import ToolModel as ToolModel
 from fflin.linear.exchange import ToolGain as ToolGain
+from fflin.linear.tool_trajectory import ToolTrajectory as ToolTrajectory
+from fflin.linear.tool_trajectory import ToolSchedule as ToolSchedule
 from fflin.linear.check import check as check
 from fflin.linear.check import Check as Check
 

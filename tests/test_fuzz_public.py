@@ -43,6 +43,8 @@ def results(name):
 
 RESULTS = {
     "ToolGain",
+    "ToolSchedule",
+    "ToolTrajectory",
     *(
         "Campaign",
         "Capture",

@@ -10,7 +10,11 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from fflin.base.errors import MissingPackageError
+
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from fflin.base.validation import Array
 
 MOST_ROWS, _SPARE = 20, 2  # rows of a cut table; up to _SPARE more are not cut
@@ -140,3 +144,16 @@ def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str
     below = " " * (len(title) + 2)
     text = textwrap.fill(f"{title}: {', '.join(entries)}", width(), subsequent_indent=below)
     return text.replace("\xa0", " ")
+
+
+def data_frame(columns: Sequence[str], rows: Array, index: str) -> DataFrame:
+    """Return rows as a pandas data frame whose index is the column named `index`."""
+    try:
+        import pandas
+    except ImportError:
+        raise MissingPackageError(
+            "to_pandas needs pandas; install it with: pip install pandas"
+        ) from None
+    table = pandas.DataFrame(rows, columns=list(columns))
+    framed: DataFrame = table.set_index(index)
+    return framed

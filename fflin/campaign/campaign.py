@@ -17,6 +17,7 @@ from fflin.base import intervals
 from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import CODECS, reading
+from fflin.base.tables import data_frame
 from fflin.base.validation import Array, FrozenArrays, Mask, dimension, instance, share, whole
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
@@ -26,6 +27,8 @@ from fflin.campaign.spreads import SEED
 from fflin.linear.files import labels, write_table
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from fflin.campaign.runs import CampaignJob
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
@@ -422,17 +425,35 @@ class Campaign(FrozenArrays):
         if target.suffix not in (".csv", ".mat"):
             self._save(target)
             return
-        finals = (*KINDS, *self.state_names, *self.input_names)
-        names = [f"drawn {name}" for name in self.names] + ["end", *finals]
-        names += [f"worst {name}" for name in finals] + [f"settle {kind}" for kind in KINDS]
-        values, units = zip(*map(self.figure, names), strict=True)
-        columns = labels(["stop", *names], ["", *units])
-        rows = np.column_stack((self.stop, *values))
+        columns, rows = self._table()
         if target.suffix == ".csv":
             write_table(target, columns, rows)
             return
         table = {"columns": np.array([columns], dtype=object), "runs": rows}
         write_atomically({target: CODECS[".mat"][0](table, True)})
+
+    def _table(self) -> tuple[list[str], Array]:
+        """Return the columns and the rows of the table of figures, with one row for each run."""
+        finals = (*KINDS, *self.state_names, *self.input_names)
+        names = [f"drawn {name}" for name in self.names] + ["end", *finals]
+        names += [f"worst {name}" for name in finals] + [f"settle {kind}" for kind in KINDS]
+        values, units = zip(*map(self.figure, names), strict=True)
+        columns = labels(["stop", *names], ["", *units])
+        return columns, np.column_stack((self.stop, *values))
+
+    def to_pandas(self) -> DataFrame:
+        """Return the table of figures as a pandas data frame, with the number of the run as index.
+
+        The columns are those of the .csv file that `save` writes.
+
+        Raises
+        ------
+        MissingPackageError
+            If pandas is not installed.
+        """
+        columns, rows = self._table()
+        runs = np.column_stack((np.arange(len(rows)), rows))
+        return data_frame(["run", *columns], runs, index="run")
 
     def _save(self, path: Path, **texts: str) -> None:
         """Write the campaign and additional strings, such as the digest of the call, to a file."""

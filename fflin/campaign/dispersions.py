@@ -20,7 +20,15 @@ from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Policy, StateFeedback, bound, decider, feedback_of
+from fflin.control.policies import (
+    Allocation,
+    Policy,
+    StateFeedback,
+    bound,
+    decider,
+    feedback_of,
+    fresh,
+)
 from fflin.control.tracking import TrajectoryOutputFeedback
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
@@ -379,7 +387,7 @@ class Dispersions:
 
     def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
         """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
-        plant, policy, rows = self._plant, self._policy, drawn[None]
+        plant, policy, rows = self._plant, fresh(self._policy), drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
         if bodies:

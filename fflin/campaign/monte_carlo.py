@@ -71,7 +71,9 @@ def monte_carlo(
     ----------
     robot : Robot
     policy : policy, GainSchedule or None
-        Policy as in `simulate`.
+        Policy as in `simulate`. Each run has its own copy of an object with memory, after its
+        method ``reset()`` was called if it has one, so no run depends on another. An object with a
+        method ``bind(robot)`` is bound anew for each run instead.
     dispersions : mapping
         Mapping {name, group or pattern: spread}, or the result of `load_dispersions`. A spread is
         one of

@@ -258,7 +258,9 @@ FORMS: dict[str, Form] = {
     "limits": {"choices": ("urdf", "none"), "default": "urdf"},
     "engine": {"choices": ("compiled", "python")},
     "scene": {"choices": ("space", "lab")},
-    "for": {"choices": ("drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates")},
+    "for": {
+        "choices": ("drake", "mujoco", "pinocchio", "crocoddyl", "spart", "euler", "euler_rates")
+    },
     "real": {"choices": ("double", "float"), "default": "double"},
     **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
     "plot": one(OutputFile((".png", ".pdf", ".svg")), "FILE"),

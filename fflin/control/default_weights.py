@@ -19,6 +19,10 @@ from fflin.linear.model import LinearModel
 # inputs are held for h seconds, the frequency of the fastest mode is at most _HELD / h [rad/s].
 BANDWIDTH, _HELD = 0.2, 0.3
 
+# If the inputs hold the robot against gravity, the nominal bandwidth is at least this fraction of
+# sqrt(g / r) [rad/s], with the radius of gyration r: slower loops leave its fall to the robot.
+_OF_FALL = 0.25
+
 # Design displacements, from which the robot must return without exceeding a limit: the ROTATION of
 # the base [deg], its OFFSET in radii of gyration, and the ANGLE [rad] or LENGTH [m] of a joint. A
 # joint displacement is at most TRAVEL times the joint's position limit.
@@ -38,6 +42,10 @@ _LEAST_REACH = 1e-3
 # The inputs count as having no effect on coordinate i if the diagonal entry i of S R^-1 S' is at
 # most this times D_i (10.7).
 _IDLE = 1e-12
+
+# Nor do the inputs have an effect in a direction in which the eigenvalue of S R^-1 S', in units of
+# D, is below this.
+_NO_EFFECT = 1e-9
 
 # Largest number of iterations for the bandwidth of a robot with dampers. Iterations are needed,
 # because the bandwidth depends on the inertia M + B / w, which depends on the bandwidth w.
@@ -92,6 +100,7 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
             f"the states of the model of '{lin.robot}' are not coordinates and their rates, which "
             "the default weights require; give Q and R"
         )
+    pace = pace._replace(bandwidth=max(pace.bandwidth, _OF_FALL * _rate_of_fall(lin)))
     damping, w = _damping(lin), pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
         before, M = w, lin.M + damping / w
@@ -137,13 +146,10 @@ def _of_inertia(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
             "it, or give Q and R"
         )
-    # Effect S R^-1 S' of the inputs on the coordinates. This matrix is made positive definite,
-    # because its inverse is needed for the gain.
     reach = (S / cost) @ S.T
     idle = reach.diagonal() <= _IDLE * D
     reach[idle, idle] = D[idle]
-    if np.linalg.eigvalsh(reach / np.sqrt(np.outer(D, D)))[0] < 1e-9:
-        reach += np.diag(D)
+    reach = _definite(reach, np.sqrt(D))
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
     # Scale the cost so that the frequency of the slowest mode is the bandwidth w.
@@ -193,6 +199,22 @@ def _of_inertia(
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
 
 
+def _definite(reach: Array, sizes: Array) -> Array:
+    """Return the effect S R^-1 S' (m, m) of the inputs, made positive definite.
+
+    The gain needs its inverse. In directions without an effect, it becomes D, which is the square
+    of `sizes` (m,). All other directions keep their effect, so that a weak one is not mistaken for
+    a strong one.
+    """
+    effects, directions = np.linalg.eigh(reach / np.outer(sizes, sizes))
+    if effects[0] >= _NO_EFFECT:
+        return reach
+    effects[effects < _NO_EFFECT] = 1.0
+    root = sizes[:, None] * directions * np.sqrt(effects)
+    definite: Array = root @ root.T
+    return definite
+
+
 def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
@@ -216,18 +238,35 @@ def _on_velocities(
     return at
 
 
+def _rate_of_fall(lin: LinearModel) -> float:
+    """Return sqrt(g / r) [rad/s], with the gravity g that the inputs balance; 0 without gravity."""
+    names = list(lin.state_names)
+    if names[:6] != [*state_keys(())[:6]]:
+        return 0.0
+    m = len(lin.M)
+    # A rotation by the angle 2 q_b turns the force that balances gravity.
+    by_turn = rate_matrix(lin)[m + 3 : m + 6, :3]
+    return math.sqrt(0.5 * float(np.linalg.norm(by_turn, 2)) / _radius_of_gyration(lin))
+
+
+def _radius_of_gyration(lin: LinearModel) -> float:
+    """Return the radius of gyration [m] of the robot.
+
+    It is the radius of a thin spherical shell with the robot's mass and trace of inertia.
+    """
+    M, mass = lin.M, lin.M[3, 3]
+    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
+    moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
+    return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
+
+
 def displacements(lin: LinearModel, fraction: float) -> Array:
     """Return the design displacements (m,) of the coordinates, multiplied by `fraction`."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
-    M, radius, size = lin.M, 1.0, np.empty(m)
+    radius, size = 1.0, np.empty(m)
     if names[:6] == state_keys(())[:6]:
-        # The radius of gyration is the radius of a thin spherical shell that has the mass of the
-        # robot and the trace of its inertia.
-        mass = M[3, 3]
-        center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
-        moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
-        radius = math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
+        radius = _radius_of_gyration(lin)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
             size[i] = math.sin(math.radians(fraction * ROTATION / 2.0))

@@ -62,6 +62,7 @@ def mpc(
     R: Weight | None = None,
     *,
     horizon: int = 20,
+    sample: float | None = None,
     dt: float | None = None,
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
@@ -97,8 +98,10 @@ def mpc(
         model and in `tvlqr` for a trajectory. The argument `weights` selects the rule.
     horizon : int
         Number N of samples in the horizon.
+    sample : float
+        Sampling time h [s] of the controller; by default the sampling time of a sampled model.
     dt : float
-        Sampling time h [s].
+        Former name of `sample`.
     limits : "urdf", float, mapping or list of them, optional
         Limits as in `simulate`, for inputs, states and outputs: {name, group or pattern: magnitude,
         or (least, largest)}. The limits bound the values of these signals. Along a trajectory,
@@ -137,7 +140,7 @@ def mpc(
     --------
     >>> robot = fflin.load("planar_detumble")
     >>> lin = fflin.linearize(robot)
-    >>> policy = fflin.mpc(lin, dt=0.2, horizon=10, limits={"tau_b": 2.0, "tau_m": 1.0})
+    >>> policy = fflin.mpc(lin, sample=0.2, horizon=10, limits={"tau_b": 2.0, "tau_m": 1.0})
     >>> q0 = fflin.configuration(robot, {"joint_2": 0.4})
     >>> motion = fflin.simulate(robot, policy, q0=q0, duration=4.0, dt=0.05)
     >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
@@ -145,14 +148,17 @@ def mpc(
     """
     instance("lin", lin, (LinearModel, LinearTrajectory), "a LinearModel or a LinearTrajectory")
     samples = whole("horizon", horizon, 1)
-    if dt is None and not lin.dt:
-        raise InputError("dt is missing; give the sampling time [s]")
-    dt = number("dt", lin.dt if dt is None else dt)
+    if sample is not None and dt is not None:
+        raise InputError("sample and dt are both given, but dt is the former name of sample")
+    sample = dt if sample is None else sample
+    if sample is None and not lin.dt:
+        raise InputError("sample is missing; give the sampling time [s]")
+    dt = number("sample", lin.dt if sample is None else sample)
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
-            "continuous model and dt="
+            "continuous model and sample="
         )
     ahead = _unplanned(source, limits, samples, dt)
     if isinstance(source, LinearTrajectory):

@@ -1,8 +1,10 @@
 """Policies that compute the inputs: state feedback about a point, and allocation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from itertools import compress
+from types import BuiltinFunctionType, FunctionType
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -350,6 +352,10 @@ def decider(policy: object) -> object:
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
+# Functions have no memory of their own that could be copied.
+_FUNCTIONS = FunctionType, BuiltinFunctionType
+
+
 def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
     """Return the frame and the reference of a policy's states; each is None if it is unknown."""
     lin, _ = feedback_of(policy)
@@ -368,6 +374,26 @@ def bound(policy: object, robot: Robot) -> Policy:
             "StateFeedback(lin, gain.K)"
         )
     return result
+
+
+def fresh(policy: object) -> object:
+    """Return a policy for one more run, without the memory of an earlier run.
+
+    A policy with a method `bind` gets new memory when it is bound. Of any other object, this is a
+    copy, after its method `reset` was called if it has one. Plain functions are not copied.
+    """
+    if isinstance(policy, Allocation):
+        return replace(policy, policy=fresh(policy.policy))
+    if policy is None or hasattr(policy, "bind") or isinstance(policy, _FUNCTIONS):
+        return policy
+    try:
+        own = deepcopy(policy)
+    except TypeError:  # it holds something that cannot be copied, such as a lock
+        own = policy
+    reset = getattr(own, "reset", None)
+    if callable(reset):
+        reset()
+    return own
 
 
 def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:

@@ -97,7 +97,7 @@ def _at_rest(robot: Robot, q: Array, v: Array) -> LinearModel:
     still, wheels = np.zeros(robot.nv), robot.wheels_at(v)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in wheels]
     still[spinning] = v[spinning]
-    held = equilibrium(robot, q, v=still)
+    held = equilibrium(robot, q, v=still, tilt=False)
     return Linearizer(robot, moving=True)(held.q, still, held.u)
 
 

@@ -30,6 +30,8 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
+    from fflin.linear.tool_trajectory import ToolSchedule
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule(ModelDesign):
@@ -125,6 +127,26 @@ class GainSchedule(Schedule):
         require_same(made, state, "input", self.input_names, None)
         parts = self.knots, self.q, self.v, self.u
         return Trajectory(robot, *parts, hold=self.hold, frame=self.frame)
+
+    def to(self, tool: str, robot: Robot) -> ToolSchedule:
+        """Return the gains and the trajectory in the coordinates of Pinocchio or Crocoddyl.
+
+        Parameters
+        ----------
+        tool : {"pinocchio", "crocoddyl"}
+        robot : Robot
+            The robot of the trajectory.
+
+        Raises
+        ------
+        InputError
+            If the tool has other axes, or the robot has other states or inputs.
+        UnknownNameError
+            If the tool is unknown.
+        """
+        from fflin.linear.tool_trajectory import tool_schedule
+
+        return tool_schedule(self, tool, robot)
 
     def gain(self, t: float) -> Array:
         """Return the gain at time t, or raise `InputError` if t is outside the knots.

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid, signals
-from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance
-from fflin.dynamics.coordinates import ORBITAL, Frame, forces_of, frame_of
+from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance, truth
+from fflin.dynamics.coordinates import LINEAR, ORBITAL, Frame, forces_of, frame_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.linearization import Linearizer
@@ -25,6 +26,12 @@ from fflin.robot.robot import Robot
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
+# Largest number of steps of the search for a tilt, and the length [rad] of its longest step. A
+# direction of the tilt counts as without effect if its effect is below this fraction of the
+# largest; this removes the rotation about the vertical.
+_MOST_TILTS, _LONGEST_TILT, _SMALL_EFFECT = 50, 0.5, 1e-9
+
+
 @dataclass(frozen=True, eq=False)
 class Equilibrium(FrozenArrays):
     """Result of `equilibrium`: minimum-norm inputs, spring deflections and residual forces.
@@ -33,12 +40,15 @@ class Equilibrium(FrozenArrays):
     ----------
     q : ndarray (nq,)
         Equilibrium configuration, to be given to `linearize` as q. This configuration differs from
-        the given configuration by the spring deflections of joints without a motor. In orbit, the
-        base may be displaced, see `equilibrium`.
+        the given configuration by the spring deflections of joints without a motor, and by the
+        tilt of the base. In orbit, the base may be displaced, see `equilibrium`.
     u : ndarray (nu,)
         Minimum-norm inputs, to be given to `linearize` as u.
     sag : ndarray (n,)
         Deflection of each joint from its given position [rad | m].
+    tilt : ndarray (3,)
+        Rotation vector [rad] from the given attitude of the base to the attitude in q, in base
+        axes. It is nonzero only under gravity, see `equilibrium`.
     residual : ndarray (6 + n,)
         Generalised forces that the inputs do not balance. Forces on the base are in base axes.
     input_names, input_units : tuple of str
@@ -61,6 +71,7 @@ class Equilibrium(FrozenArrays):
     q: Array
     u: Array
     sag: Array
+    tilt: Array
     residual: Array
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
@@ -71,6 +82,9 @@ class Equilibrium(FrozenArrays):
         said = "u: all zero"
         if self.u.any():
             said = signals("u", self.u, self.input_names, self.input_units)
+        if self.tilt.any():
+            angles = np.degrees(self.tilt)
+            said += f"\n{signals('tilt of the base', angles, ('x', 'y', 'z'), ('deg',) * 3)}"
         if not (shown := np.where(np.abs(self.sag) > _ROUNDING, self.sag, 0.0)).any():
             return said
         names = [name.partition(".")[2] for name in self.force_names[6:]]
@@ -85,6 +99,7 @@ def equilibrium(
     v: Array | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
+    tilt: bool = True,
 ) -> Equilibrium:
     r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
@@ -116,6 +131,10 @@ def equilibrium(
     force on the joint. Newton's method finds the deflected position. Its Jacobian is
     :math:`M\,\partial\dot\nu/\partial q_m`, with the acceleration :math:`\dot\nu` of the robot.
 
+    Under gravity, the inputs may balance the forces at another attitude only, such as a robot with
+    rotors whose arm is stretched out. If a force on the base is missing at the given attitude, the
+    base is tilted until the inputs balance all forces, with the smallest rotation in each step.
+
     Parameters
     ----------
     robot : Robot
@@ -131,6 +150,9 @@ def equilibrium(
         Placement whose axes are the reference axes, as in `linearize`. The default is the base
         placement; inputs on the base are then in base axes for any `frame`. For a robot in orbit,
         the default is the orbital frame.
+    tilt : bool
+        Whether the base may be tilted under gravity, by less than 90 deg. A base that moves is
+        never tilted.
 
     Returns
     -------
@@ -144,7 +166,8 @@ def equilibrium(
     EquilibriumError
         If one of these conditions is true:
 
-        - no inputs balance the forces; the message names the residual forces;
+        - no inputs balance the forces, at the given attitude or at any that the search reaches;
+          the message names the residual forces at the given attitude;
         - springs are too weak for their load, or Newton's method does not converge;
         - no inputs can make the motion steady.
     InputError
@@ -167,6 +190,7 @@ def equilibrium(
     True
     """
     state = StateMap(robot, frame=frame, reference=reference)
+    tilt = truth("tilt", tilt)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     if robot.orbit:  # put the reference at the base, so that forces and inputs are in base axes
         own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
@@ -174,6 +198,8 @@ def equilibrium(
     else:
         linearizer = Linearizer(robot, moving=True)
     balance = first = _settled(linearizer, state, given, v, spun=False)
+    if tilt and first.asks_tilt:
+        balance = _tilted(linearizer, state, first, v)
     attempts = [(given, True)] * bool(first.lin.wheels)
     if robot.orbit and not given[:3].any() and not _pushed(linearizer):
         centered = on_orbit(robot, given, state.frame)
@@ -204,8 +230,11 @@ def equilibrium(
         R = state.reference.rotation.T @ base.rotation
         for columns in actuation.held:
             u[columns] = R @ u[columns]
+    turned = pin.log3(pin.Quaternion(given[3:7]).matrix().T @ pin.Quaternion(at[3:7]).matrix())
+    rotation = turned if (at[3:7] != given[3:7]).any() else np.zeros(3)
     names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
-    return Equilibrium(at, u, state.joints_apart(given, at), balance.residual, *names)
+    sag = state.joints_apart(given, at)
+    return Equilibrium(at, u, sag, rotation, balance.residual, *names)
 
 
 def _pushed(linearizer: Linearizer) -> bool:
@@ -260,6 +289,28 @@ def _settled(
     return balance
 
 
+def _tilted(linearizer: Linearizer, state: StateMap, start: _Balance, v: Array | None) -> _Balance:
+    """Tilt the base by Gauss-Newton steps until the inputs balance the forces.
+
+    Return `start` if no attitude within 90 deg is found.
+    """
+    balance = start
+    level = pin.Quaternion(start.lin.q[3:7]).matrix()
+    for _ in range(_MOST_TILTS):
+        step = balance.tilt_step()
+        # A long step is shortened, because the force changes its sign beyond 90 deg.
+        step *= min(1.0, _LONGEST_TILT / max(float(np.linalg.norm(step)), _LONGEST_TILT))
+        q = balance.lin.q.copy()
+        rotation = pin.Quaternion(q[3:7]).matrix() @ pin.exp3(step)
+        q[3:7] = pin.Quaternion(rotation).coeffs()
+        balance = _settled(linearizer, state, q, v, spun=False)
+        if np.linalg.norm(pin.log3(level.T @ rotation)) >= 0.5 * np.pi:
+            return start
+        if balance.holds:
+            return balance
+    return start
+
+
 class _Balance:
     """Minimum-norm inputs that balance the forces at a point, and the residual forces.
 
@@ -271,6 +322,7 @@ class _Balance:
         self, linearizer: Linearizer, q: Array, v: Array | None, *, spun: bool = False
     ) -> None:
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
+        self.robot = robot
         self.lin = lin = linearizer(q, v)
         drift = lin.rate
         _require_steady(lin, drift)
@@ -296,7 +348,11 @@ class _Balance:
             terms, rounding = np.abs(others) @ terms, np.abs(others) @ rounding
         thrusts: Indices | list[int] = actuation.groups.get("thrust", [])
         target = mobility * wanted
-        self.u, self.left = least_norm(mobility[:, None] * columns, target, thrusts)
+        scaled = mobility[:, None] * columns
+        self.u, self.left = least_norm(scaled, target, thrusts)
+        one_sided = np.isin(np.arange(len(self.u)), thrusts)
+        self._pushing = scaled[:, ~one_sided | (self.u > 0.0)]
+        self._by_tilt = mobility[:, None] * (M @ lin.A[-len(M) :, :3])
         self.residual, self.tolerance = self.left / mobility, rounding + terms
         self._allowed = TOLERANCE * float(np.linalg.norm(target))
         self._allowed += float(np.linalg.norm(mobility * rounding))
@@ -314,6 +370,26 @@ class _Balance:
         rates = np.abs(self._to_rates @ self.left).max(initial=0.0)
         small = float(np.linalg.norm(self.left)) <= self._allowed
         return small or bool(rates <= self.lin.bound(TOLERANCE))
+
+    @property
+    def asks_tilt(self) -> bool:
+        """Whether a base at rest lacks a force against gravity."""
+        lacking = float(np.linalg.norm(self.left[LINEAR])) > self._allowed
+        return lacking and not self.lin.v[:6].any() and any(self.robot.gravity)
+
+    def tilt_step(self) -> Array:
+        """Return the smallest rotation (3,) [rad] of the base that removes the residual forces.
+
+        The rotation is in base axes, and the residual forces are linearised in it. The inputs
+        balance what they can, so only the part of a change that they cannot balance counts.
+        """
+        basis, sizes, _ = np.linalg.svd(self._pushing)
+        rank = int((sizes > _EPS * len(basis) * sizes.max(initial=0.0)).sum())
+        beyond = basis[:, rank:].T
+        # A (nv, 3) is the derivative of the accelerations with respect to q_b, half the rotation.
+        effect = 0.5 * beyond @ self._by_tilt
+        step: Array = np.linalg.lstsq(effect, -beyond @ self.left, rcond=_SMALL_EFFECT)[0]
+        return step
 
 
 def _without_wheels(M: Array, wheels: Indices) -> Array:

@@ -18,7 +18,12 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, StateSpace
-from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
+from fflin.linear.tool_coordinates import (
+    STEPPING,
+    Jacobians,
+    ToolCoordinates,
+    tool_coordinates,
+)
 from fflin.robot.robot import Robot
 
 # An entry of A or B that is exactly zero stays zero if its change, divided by the largest entry, is
@@ -31,8 +36,8 @@ class ToolModel(StateSpace, Design):
     r"""Linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The state x consists of the tool's q and v. If the tool's q is on a manifold (mujoco, pinocchio,
-    spart), x contains a tangent vector instead of q: the difference of q from the operating point,
-    in the order of v.
+    crocoddyl, spart), x contains a tangent vector instead of q: the difference of q from the
+    operating point, in the order of v.
 
     Attributes
     ----------
@@ -91,12 +96,13 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     lin : LinearModel
         Model of this robot about any operating point. If the model is in discrete time, so is the
         result.
-    tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
+    tool : {"drake", "mujoco", "pinocchio", "crocoddyl", "spart", "euler", "euler_rates"}
         Name of the tool, or of the attitude coordinates.
     dt : float, optional
-        Time step [s] of MuJoCo; only for "mujoco". If `dt` is given, A and B are the discrete-time
-        matrices that ``mjd_transitionFD`` returns for the Euler integrator. If the robot has
-        dampers, disable ``eulerdamp`` in MuJoCo, because its matrices otherwise differ.
+        Time step [s]; only for "mujoco" and "crocoddyl". If `dt` is given, A and B are the
+        discrete-time matrices that ``mjd_transitionFD`` returns for the Euler integrator, or Fx and
+        Fu of Crocoddyl's ``IntegratedActionModelEuler``. If the robot has dampers, disable
+        ``eulerdamp`` in MuJoCo, because its matrices otherwise differ.
 
     Returns
     -------
@@ -127,7 +133,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
-    sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
+    sampled, whole, step = lin.dt, lin.generator, step_of(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform its continuous-time model instead")
     lin, (kind, own, to, rates) = whole, _jacobians_at(robot, whole, tool)
@@ -142,7 +148,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
         outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
-        A, B, rate = _euler_step(A, B, rate, step)
+        A, B, rate = euler_step(A, B, rate, step, tool)
     f0: Array = rate * (not lin.moving)
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
@@ -163,8 +169,8 @@ class ToolGain(Design):
     Attributes
     ----------
     K : ndarray (nu, nx)
-        Gain. If the tool's q is on a manifold (mujoco, pinocchio), ``x - x0`` consists of the
-        difference of configurations that the tool computes on this manifold, and of the
+        Gain. If the tool's q is on a manifold (mujoco, pinocchio, crocoddyl), ``x - x0`` consists
+        of the difference of configurations that the tool computes on this manifold, and of the
         difference of velocities.
     model : ToolModel
         The model in the tool's coordinates, with names, x0, u0, and the reference `q` and `v`.
@@ -257,7 +263,7 @@ def from_tool(
     """
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     about = partial(linearize, robot, q, v, frame=frame, reference=reference, moving=moving)
-    lin, step = about(), _step(tool, dt)
+    lin, step = about(), step_of(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
         _, own, to, _ = _jacobians_at(robot, lin, tool)
@@ -266,7 +272,7 @@ def from_tool(
         return lin
     _, own, to, rates = _jacobians_at(robot, lin, tool)
     ours = transformed(own, to, lin.A, lin.B)
-    ours = _euler_step(*ours, to.P @ rates, step)[:2] if step else ours
+    ours = euler_step(*ours, to.P @ rates, step, tool)[:2] if step else ours
     changes = []
     for name, given, expected in zip("AB", (A, B), ours, strict=True):
         change = expected if given is None else shaped(name, given, expected.shape)
@@ -311,26 +317,31 @@ def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[A
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
 
 
-def _step(tool: str, dt: float | None) -> float:
+def step_of(tool: str, dt: float | None) -> float:
     """Check the time step dt [s] of a tool, and return dt, or 0 if dt is None."""
     h = 0.0 if dt is None else number("dt", dt)
-    if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
+    if dt is not None and (not 0.0 < h < 1e3 or str(tool) not in STEPPING):
         raise InputError(
-            f"dt is {h:g} s for {tool}, but only mujoco has a dt, a positive time step below 1000 s"
+            f"dt is {h:g} s for {tool}, but only {' and '.join(STEPPING)} have a dt, a positive "
+            "time step below 1000 s"
         )
     return h
 
 
-def _euler_step(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
+def euler_step(A: Array, B: Array, rate: Array, h: float, tool: str) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a semi-implicit Euler step of h [s] (15.6).
 
-    A, B and `rate`, the derivative dx'/dt, are in the coordinates of MuJoCo. For the base, linear
-    rows precede angular rows.
+    A, B and `rate`, the derivative dx'/dt, are in the coordinates of MuJoCo or Crocoddyl. For the
+    base, linear rows precede angular rows.
     """
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)
-    K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
+    if tool == "mujoco":
+        K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
+    else:
+        K[:6, :6] = pin.exp6(-moved[:6]).toActionMatrix()
+        G[:6, :6] = h * pin.Jexp6(moved[:6])
     A, B = h * A[nv:] + np.eye(nv, 2 * nv, nv), h * B[nv:]
     A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
     A[:nv, :nv] += K

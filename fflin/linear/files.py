@@ -178,8 +178,7 @@ def _csv_path(path: Path, key: str) -> Path:
 
 def write_csv(path: Path, traj: Trajectory) -> None:
     """Write a trajectory as a csv table with named columns, for `Trajectory.load`."""
-    columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
-    names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
+    names = [*trajectory_columns(traj), "hold", "frame"]
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
     table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
     content = csv_table(table)
@@ -187,6 +186,12 @@ def write_csv(path: Path, traj: Trajectory) -> None:
         digest = record.content_digest({"table": content})
         content = csv_table([[*names, record.CHECKSUM], *([*row, digest] for row in table[1:])])
     write_atomically({path: content})
+
+
+def trajectory_columns(traj: Trajectory) -> list[str]:
+    """Return the names of the columns t, q, v and u of a trajectory."""
+    columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
+    return ["t", *columns, *Actuation(StateMap(traj.robot)).names]
 
 
 def labels(names: Sequence[str], units: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel, refuse_sampled
 from fflin.linear.trajectory import Trajectory, intervals_of
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.linear.tool_trajectory import ToolTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,6 +165,30 @@ class LinearTrajectory(Trajectory):
         found = np.array([transition for _, transition in transitions(self, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
+
+    def to(self, tool: str, *, dt: float | None = None) -> ToolTrajectory:
+        """Return the models at all knots in the coordinates of another tool.
+
+        Parameters
+        ----------
+        tool : {"pinocchio", "crocoddyl"}
+            The errors of these tools are in base axes, as here. For other tools, convert the model
+            at each knot by ``along[k].to(tool)``.
+        dt : float, optional
+            Time step [s] of Crocoddyl: A and B are then Fx and Fu of a semi-implicit Euler step
+            from each knot, see `transform`.
+
+        Raises
+        ------
+        InputError
+            If the tool has other axes, `dt` is not allowed for it, or the trajectory is sampled and
+            `dt` is given.
+        UnknownNameError
+            If the tool is unknown.
+        """
+        from fflin.linear.tool_trajectory import tool_trajectory
+
+        return tool_trajectory(self, tool, dt)
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> LinearTrajectory:  # type: ignore[override]

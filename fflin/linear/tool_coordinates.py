@@ -41,10 +41,15 @@ TOOLS = {
     "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
     "mujoco": Convention("tangent", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
     "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
+    "crocoddyl": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
     "spart": Convention("tangent", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
     "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
     "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
 }
+
+
+# Tools whose matrices can be those of one time step of the semi-implicit Euler method (15.6).
+STEPPING = ("mujoco", "crocoddyl")
 
 
 class Jacobians(NamedTuple):

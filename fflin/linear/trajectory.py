@@ -15,7 +15,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
-from fflin.base.tables import folded
+from fflin.base.tables import data_frame, folded
 from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
@@ -26,6 +26,8 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from fflin import Motion
     from fflin.base.validation import Array, Indices, Vector
 
@@ -37,8 +39,9 @@ _MOTION = 1e-2
 _FARTHEST_TURN = 2.5
 
 _CAUSES = (
-    "usual causes: wrong hold, wrong axes (frame) of u or v, wrong units of t or of the joints, "
-    "or springs, damping or gravity that differ from the robot"
+    "usual causes: wrong hold, wrong axes (frame) of u or v, quaternions that are not in the order "
+    "x, y, z, w, knots of a coarse or semi-implicit Euler integration, wrong units of t or of the "
+    "joints, or springs, damping or gravity that differ from the robot"
 )
 
 # The integration over an interval is repeated with halved steps. The repetition ends if the state
@@ -227,6 +230,10 @@ class Trajectory(Design):
         u: Array = self.u[k]
         return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
 
+    def accelerations(self) -> Array:
+        """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
+        return self._aba.accelerations(self.q, self.v, self.u_base)
+
     def resampled(self, dt: float) -> Trajectory:
         """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
 
@@ -306,6 +313,21 @@ class Trajectory(Design):
         else:
             record = record_of(self) | {"input_names": list(self.actuation.names)}
             write_record(target, record, checksummed=self.verified)
+
+    def to_pandas(self) -> DataFrame:
+        """Return t, q, v and u as a pandas data frame, with the times as its index.
+
+        The columns are those of the .csv file that `save` writes.
+
+        Raises
+        ------
+        MissingPackageError
+            If pandas is not installed.
+        """
+        from fflin.linear.files import trajectory_columns
+
+        rows = np.column_stack((self.t, self.q, self.v, self.u))
+        return data_frame(trajectory_columns(self), rows, index="t")
 
     @staticmethod
     def load(  # type: ignore[override]

@@ -50,9 +50,10 @@ class Robot(Coordinates):
     Attributes
     ----------
     model : pin.Model
-        Pinocchio model with a free-flyer root joint and zero gravity. Mimic joints and reaction
-        wheels with an inertia are ordinary joints of `model`. The model must not be modified; to
-        use another model, make another robot by `from_model`.
+        Pinocchio model with a free-flyer root joint. ``model.gravity`` is zero even under gravity,
+        which is in `gravity`: for Pinocchio's own functions, set it in a copy. Mimic joints and
+        reaction wheels with an inertia are ordinary joints of `model`. The model must not be
+        modified; to use another model, make another robot by `from_model`.
     name : str
         Name of the robot, or the file name of its URDF without the extension.
     urdf : Path or None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +14,7 @@ from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.figures import Figure
 from fflin.base.record import Design
+from fflin.base.tables import data_frame
 from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import RECORDS, as_path, check_ending
 from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
@@ -34,6 +35,9 @@ from fflin.simulation.report import (
     pulse_thrusters,
     saturated,
 )
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FORMATS = (*RECORDS, ".csv")
 
@@ -347,9 +351,25 @@ class Motion(StatesAndInputs, Design):
             super().save(target)
             return
         record.require_finite({"t": self.t, "x": self.x, "u": self.u})
+        write_table(target, *self._table())
+
+    def _table(self) -> tuple[list[str], Array]:
+        """Return the columns and the rows of times, states and inputs."""
         names = ["t", *self.state_names, *(f"u.{name}" for name in self.input_names)]
         columns = labels(names, ["s", *self.state_units, *self.input_units])
-        write_table(target, columns, np.column_stack((self.t, self.x, self.u)))
+        return columns, np.column_stack((self.t, self.x, self.u))
+
+    def to_pandas(self) -> DataFrame:
+        """Return times, states and inputs as a pandas data frame, with the times as its index.
+
+        The columns are those of the .csv file that `save` writes.
+
+        Raises
+        ------
+        MissingPackageError
+            If pandas is not installed.
+        """
+        return data_frame(*self._table(), index="t [s]")
 
     def plot(self, path: str | Path | None = None, *, show: Sequence[str] | None = None) -> Figure:
         """Draw the motion by `plot_motion`, and save the figure if a path is given."""

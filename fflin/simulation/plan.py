@@ -292,7 +292,8 @@ def _functions(options: SimulationOptions) -> tuple[Event, ...]:
     events = tuple(instance("events", options.events, Sequence, expected))
     functions: list[tuple[str, object, str]] = [("event", event, "(t, q, v)") for event in events]
     functions.append(("callback", options.callback, "(t, q, v, u)"))
-    functions.append(("disturbance", options.disturbance, "(t, q, v)"))
+    if not isinstance(options.disturbance, Mapping):
+        functions.append(("disturbance", options.disturbance, "(t, q, v)"))
     for name, given, arguments in functions:
         if not callable(given) and (given is not None or name == "event"):
             kind = type(given).__name__

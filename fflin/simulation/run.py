@@ -10,7 +10,8 @@ disturbance and dampers do no work.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -18,11 +19,13 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg.lapack import dposv
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
+from fflin.base.names import by_name
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, ArrayLike, as_double, vector
+from fflin.base.validation import Array, ArrayLike, as_double, dimension, number, vector
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
 from fflin.dynamics.integrals import integrals
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.dynamics.state import StateMap
@@ -34,9 +37,14 @@ from fflin.robot.mass_properties import require_inertia
 if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
 
-# Function of (t, q, v) that returns a generalised force (nv,) in Pinocchio's order: force on the
-# base, torque on the base, forces or torques of the joints. The first two are in base axes.
-Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+# Generalised forces {name or group: value}, such as {"tau_b": (0, 0, 1e-3), "tau_m.joint_1": 0.2}.
+# The torque and the force on the base are in the axes of the inputs tau_b and F_b.
+Forces: TypeAlias = Mapping[str, ArrayLike]
+
+# Constant forces by name, or a function of (t, q, v) that returns them. The function may instead
+# return a generalised force (nv,) in Pinocchio's order: force on the base, torque on the base,
+# forces or torques of the joints. The first two are then in base axes.
+Disturbance: TypeAlias = Forces | Callable[[float, Array, Array], Forces | ArrayLike]
 
 # If an entry of v exceeds this magnitude [SI units], the motion counts as diverging. In a diverging
 # motion, a disturbance that is not finite raises no error.
@@ -72,6 +80,7 @@ class Plant(Aba):
         require_inertia(robot)
         super().__init__(state)
         self.disturbance = disturbance
+        self._warned = False  # whether a warning of the order of a disturbance was given
         nu, groups = len(self.actuation.names), self.actuation.groups
         # Indices in u at which the base torque and the base force begin, if they are inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
@@ -132,12 +141,42 @@ class Plant(Aba):
     def disturbing(self, t: float, q: Array, v: Array) -> Array:
         """Return the generalised force (nv,) of the disturbance, or raise `InputError`."""
         assert self.disturbance is not None
-        name = f"at t = {t:g} s, disturbance(t, q, v)"
-        disturbed = as_double(name, self.disturbance(t, q.copy(), v.copy()))
+        name, given = f"at t = {t:g} s, disturbance(t, q, v)", self.disturbance
+        forces = given if isinstance(given, Mapping) else given(t, q.copy(), v.copy())
+        if isinstance(forces, Mapping):
+            return self._named_force(forces, q)
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                "the disturbance is an array in Pinocchio's order, with the force on the base "
+                "before the torque, both in base axes; this form is deprecated; give forces by "
+                "name, such as {'tau_b': (0, 0, 1e-3)}, in the axes of the inputs",
+                FflinWarning,
+                2,
+            )
+        disturbed = as_double(name, forces)
         if np.abs(v).max() < _DIVERGED:
             expected = "a generalised force (nv,) in Pinocchio's order"
             disturbed = vector(name, disturbed, self.robot.nv, expected)
         return disturbed
+
+    def _named_force(self, forces: Forces, q: Array) -> Array:
+        """Return the generalised force (nv,) of forces by name, in base axes."""
+        names = tuple(forces_of(self.robot))
+        total, single = np.zeros(len(names)), dict[str, float]()
+        for key, value in forces.items():
+            what = f"disturbance '{key}'"
+            if key in ("tau_b", "F_b") and dimension(what, value):
+                rows = ANGULAR if key == "tau_b" else LINEAR
+                total[rows] = vector(what, value, 3, "the components x, y and z")
+            else:
+                single[key] = number(what, value)
+        for index, each in by_name("generalised force", single, names).items():
+            total[index] = each
+        R = self.state.rotation(q)
+        for rows in self.state.in_reference:
+            total[rows] = total[rows] @ R
+        return self.state.lift(total)
 
     def isolated(self, *, driven: bool) -> bool:
         """Return True if no external force acts on the robot.

@@ -147,9 +147,14 @@ def simulate(
         One side of a limit may be infinite.
 
         On-off thrusters fire in pulses, whatever the limits. `Motion.passed` lists violated limits.
-    disturbance : callable, optional
-        Function disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order. Before the
-        run, it is called at times of the whole run with the initial q and v, to choose the step.
+    disturbance : mapping or callable, optional
+        Generalised forces {name or group: value}, such as ``{"tau_b": (0, 0, 1e-3)}`` or
+        ``{"F_b.x": 0.1, "tau_m.joint_1": 0.2}``, or a function disturbance(t, q, v) that returns
+        them. The torque and the force on the base are in the axes of the inputs ``tau_b`` and
+        ``F_b``. A function may also return an array (nv,) in Pinocchio's order: force, then torque
+        on the base, both in base axes, then joints. This form is deprecated and gives a warning.
+        Before the run, a function is called at times of the whole run with the initial q and v, to
+        choose the step.
     events : sequence of callable
         Functions event(t, q, v) -> float. The run ends after the step in which the value of an
         event becomes zero or negative.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from warnings import warn
 
+import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, FileError, InputError
@@ -78,7 +79,7 @@ def visualize(
     motion : Motion or Modes, optional
         Motion from `simulate` or `Campaign.replay`, or modes from `modes`. For modes, the page
         lists their names and frequencies, and animates one of them. If `motion` is omitted, a live
-        page shows the robot with a slider for each joint.
+        page shows the robot with a slider for each joint, or a file shows the robot at rest.
     html : path, optional
         HTML file to write; a temporary file by default.
     png, gif : path, optional
@@ -108,8 +109,8 @@ def visualize(
     tool : str, optional
         Frame whose path is drawn; by default "tool", or the last link of the longest chain.
     q : array_like (nq,), optional
-        Initial configuration of a live robot; by default the robot's `start`, or the neutral
-        configuration.
+        Configuration of a robot without a motion, which is initial if the robot is live; by default
+        the robot's `start`, or the neutral configuration.
     port : int
         Port of the live page; a free port by default.
     frame : {"lvlh", "hill"}, optional
@@ -157,12 +158,10 @@ def visualize(
     tool = tool_frame(robot, tool)
     from fflin.view.page import Page
 
+    if motion is None and any(file is not None for file in (html, png, gif)):
+        robot = robot.replace(orbit=None)
+        motion = _at_rest(robot, q)
     if motion is None:
-        if any(file is not None for file in (html, png, gif)):
-            raise InputError(
-                "a file is named but no motion is given; give a motion, as fflin.simulate "
-                "returns it"
-            )
         port = whole("port", port, 0, 2**16 - 1)
         q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
@@ -205,6 +204,16 @@ def visualize(
 
         webbrowser.open(shown.resolve().as_uri())
     return shown
+
+
+def _at_rest(robot: Robot, q: Array | None) -> Motion:
+    """Return a motion in which the robot stays at q (nq,), by default at its start."""
+    from fflin.simulation.simulate import simulate
+
+    q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
+    still = robot.replace(gravity=(0.0, 0.0, 0.0), stiffness={})
+    v = np.zeros(robot.nv)
+    return simulate(still, q0=q, v0=v, duration=1.0, dt=0.5, progress=False)
 
 
 def _temporary(name: str) -> Path:

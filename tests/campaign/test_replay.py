@@ -151,3 +151,33 @@ def test_runs_of_another_robot_are_not_repeated(oblique, tmp_path):
     fewer = robot.replace(appendages=[])
     with pytest.raises(fflin.InputError, match="not that of the campaign"):
         loaded.replay(0, robot=fewer, policy=None)
+
+
+class Remembering:
+    """A sampled policy whose command depends on how often it was called."""
+
+    def __init__(self, resets):
+        self.calls = 0
+        if resets:
+            self.reset = self.forget
+
+    def forget(self):
+        self.calls = 0
+
+    def __call__(self, t, q, v):
+        self.calls += 1
+        return np.array([0.01 * self.calls, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_a_policy_with_memory_starts_each_run_anew(resets):
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    policy = Remembering(resets)
+    options = {"duration": 0.5, "dt": 0.05, "sample": 0.1}
+    flown = fflin.monte_carlo(robot, policy, {"q_b.x": [0.0]}, runs=3, **options)
+    assert policy.calls == 0
+    expected = fflin.simulate(robot, Remembering(resets), **options)
+    for run in range(3):
+        motion = flown.replay(run)
+        assert np.array_equal(motion.u, expected.u) and np.array_equal(motion.v, expected.v)
+    assert np.ptp(flown.values("worst tau_b.x")) == 0.0

@@ -106,7 +106,7 @@ class Formulas:
         if self.tool == "mujoco":
             turn = pin.log3(before.rotation.T @ R)
             return np.concatenate((q[:3] - self.q0[:3], turn, apart, R @ d, w, rates))
-        if self.tool == "pinocchio":
+        if self.tool in ("pinocchio", "crocoddyl"):
             return np.concatenate((pin.log6(before.actInv(base)).vector, apart, v))
         if self.tool == "spart":
             C, c = self.centre.rotation, self.centre.translation
@@ -128,7 +128,7 @@ class Formulas:
             return np.concatenate((R.T @ a, R.T @ b, rest))
         if self.tool == "mujoco":
             return np.concatenate((b, R.T @ a, rest))
-        if self.tool == "pinocchio":
+        if self.tool in ("pinocchio", "crocoddyl"):
             return np.concatenate((b, a, rest))
         if self.tool == "spart":
             C, c = self.centre.rotation, self.centre.translation
@@ -176,7 +176,8 @@ def test_a_moving_reference_changes_tangents_alone(tool):
     assert moving.reference == "moving" and not moving.f0.any() and fixed.f0.any()
     assert relative(moving.B, fixed.B) < 1e-13
     expected, nv = np.zeros(fixed.A.shape), robot.nv
-    if tool == "pinocchio":  # Pinocchio's own transport of tangents, over a time of 0
+    if tool in ("pinocchio", "crocoddyl"):
+        # Pinocchio's own transport of tangents, over a time of 0
         ahead, behind = (pin.dIntegrate(robot.model, q, h * v)[0] for h in (1e-4, -1e-4))
         expected[:nv, :nv] = 0.5 * (ahead - behind) / 2e-4
     elif tool in ("mujoco", "spart"):
@@ -293,7 +294,7 @@ def test_mimic_joints_are_joints_to_tools(tmp_path):
         assert np.array_equal(m.T[a], -2.0 * m.T[b])
         # A model that moves as they do: x' dot = A' x' for all x' = T x.
         assert relative(m.T_left @ m.T, np.eye(len(lin.A))) < 1e-14
-        if tool != "pinocchio":
+        if tool not in ("pinocchio", "crocoddyl"):
             assert m.q[-2:] == pytest.approx([-2.0 * 0.7 + 0.3, 0.7])
         back = fflin.from_tool(robot, tool, m.q, m.v, m.u0, A=m.A, B=m.B)
         assert relative(back.A, lin.A) < 1e-13 and relative(back.B, lin.B) < 1e-13
@@ -310,7 +311,7 @@ def test_inputs_and_joints_stand_in_the_tools_order():
     order = ("panel_left", "panel_right", *robot.joint_names[:7])
     for tool in TOOLS:
         m, own = lin.to(tool), robot.joint_names
-        names = own if tool[:3] in ("pin", "eul") else order
+        names = own if tool[:3] in ("pin", "cro", "eul") else order
         assert tuple(m.input_names[6:]) == tuple(f"tau_m.{name}" for name in names)
         joints = [name[4:] for name in m.state_names if name.startswith("q_m.")]
         assert joints == [name[7:] for name in m.state_names if name[:7] == "qdot_m."] == [*names]
@@ -399,5 +400,5 @@ def test_an_orbit_has_angles_and_no_other_tool():
         assert relative(back.A, lin.A) < 1e-13 and back.frame == lin.frame == "lvlh"
     n = len(m.A) // 2
     assert relative(m.A[:n], np.eye(n, 2 * n, n)) < 1e-13  # coordinates and their rates
-    for tool in ("drake", "mujoco", "pinocchio", "spart"):
+    for tool in ("drake", "mujoco", "pinocchio", "crocoddyl", "spart"):
         refused(r"is in orbit; remove the orbit", lin.to, tool)

@@ -110,7 +110,7 @@ def light(folder):
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
         "effort": {"robot": robot, "values": {}},
-        "equilibrium": {"robot": robot, "q": q, "v": v, "frame": "hybrid"},
+        "equilibrium": {"robot": robot, "q": q, "v": v, "frame": "hybrid", "tilt": True},
         "FramePose": {"frame": "base"},
         "FrameVelocity": {"frame": "base"},
         "from_model": {"model": robot.model, "name": "x", "lock": None, "gravity": vector},

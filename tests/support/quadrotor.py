@@ -1,5 +1,7 @@
 """A quadrotor with an arm of two joints, written as URDF and inputs."""
 
+import math
+
 import fflin
 
 K = 0.016  # [m] reaction torque for each newton of thrust
@@ -39,3 +41,13 @@ def quadrotor(folder, arm=True, **fields):
     path.write_text(BODY.replace("ARM", text))
     inputs = [*ROTORS, fflin.JointTorque("*")] if arm else ROTORS
     return fflin.load(path, gravity=GRAVITY, inputs=inputs, **fields)
+
+
+def canted(degrees):
+    """Rotors without reaction torque, each inclined about its arm, so that they produce yaw."""
+    rotors = []
+    for k, ((x, y), sign) in enumerate(zip(PLACES, SIGNS, strict=True)):
+        across = math.tan(math.radians(degrees)) * sign / REACH
+        along = (-y * across, x * across, 1.0)
+        rotors.append(fflin.Thruster("base", (x, y, 0.0), along, f"rotor_{k + 1}", max=6.0))
+    return [*rotors, fflin.JointTorque("*")]

@@ -20,6 +20,8 @@ from tests.support.messages import hear_lines, says
 from tests.support.motions import settling
 from tests.support.patience import finished
 
+ORBIT = fflin.CircularOrbit(500e3)
+
 
 def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
     robot = robots["planar_detumble"]
@@ -52,12 +54,19 @@ def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
         fflin.visualize(robot, "motion", html=page)
     with pytest.raises(fflin.InputError, match=r"fflin\.Robot"):
         fflin.visualize("ets_vii", html=page)
-    with pytest.raises(fflin.InputError, match="motion"):
-        fflin.visualize(robot, html=page)
     (tmp_path / "folder.html").mkdir()
     with pytest.raises(fflin.FileError, match="folder"):
         fflin.visualize(robot, motion, html=tmp_path / "folder.html")
     assert [path.name for path in tmp_path.iterdir()] == ["folder.html"]
+
+
+@pytest.mark.parametrize("fields", [{}, {"gravity": (0, 0, -9.81)}, {"orbit": ORBIT}])
+def test_a_robot_without_a_motion_rests_on_its_page(fields, tmp_path):
+    robot = fflin.load("cubesat", **fields)
+    made = fflin.visualize(robot, html=tmp_path / "still.html")
+    assert made == tmp_path / "still.html" and "meshcat" in made.read_text(encoding="utf-8")
+    with pytest.raises(fflin.InputError, match="q"):
+        fflin.visualize(robot, html=tmp_path / "other.html", q=np.zeros(3))
 
 
 def test_a_robot_without_visuals_is_drawn_as_boxes_and_says_so(robots, tmp_path):
