@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from fflin.dynamics import points
 from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
+from fflin.linear.optimality import STATIONARY, Optimality
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel
@@ -31,6 +33,8 @@ _REACHED = 1e-7
 # A warning is given if the motion exceeds a limit by more than _BETWEEN times the limit. The motion
 # is checked at the ends of _PARTS equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
+
+_UNKNOWN = "its KKT residuals are unknown, because the last quadratic program cannot be solved"
 
 
 def plan(
@@ -56,6 +60,10 @@ def plan(
     50 iterations. The search ends earlier if the violation of the goal and the limits at the knots
     is above 0.01 and does not fall by a tenth in ten iterations. The quadratic programs are built
     from the linear models along the motion and solved by PIQP (``pip install 'fflin[mpc]'``).
+
+    ``motion.optimality`` contains the residuals of the Karush-Kuhn-Tucker conditions at the plan,
+    and `print` shows them. If the plan is not stationary, a warning states how large the gradient
+    of the effort still is, relative to the gradient without the goal and the limits.
 
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
@@ -178,8 +186,11 @@ def plan(
             warnings.warn(
                 f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
             )
+        note += f"\n{made.optimality or _UNKNOWN}"
         note += _largest(shooting, actuation, made, np.hstack((bounds, inputs)))
-        return Trajectory(robot, t, q, v, u, hold=hold, _note=note)
+        if made.optimality is None or not made.optimality.stationary:
+            warnings.warn(_not_stationary(made.optimality), FflinWarning, stacklevel=2)
+        return Trajectory(robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality)
     raise _failure(shooting, made, asked, duration)
 
 
@@ -193,6 +204,7 @@ class _Made(NamedTuple):
     at_knots: Array  # largest limit violations at the knots (nx,)
     beyond: Array  # limit violations (N, parts, nx) at the ends of all parts, relative to limits
     most: float  # largest entry of `beyond`
+    optimality: Optimality | None  # None if it could not be computed
 
     @property
     def reached(self) -> bool:
@@ -208,11 +220,14 @@ def _least(search: Search) -> _Made:
     """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
     guess = shooting.guess(search.start, search.end)
-    cost = cost / ((cost * guess[2] ** 2).sum() or cost.sum())  # cost * u**2 of the guess sums to 1
+    unit = float((cost * guess[2] ** 2).sum() or cost.sum())
+    cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
     # more than the tolerance, a second attempt has limits at the knots only.
     for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
-        q, v, u, *_ = search._replace(cost=cost, parts=parts).best(*guess)
+        (q, v, u, *_), optimality = search._replace(cost=cost, parts=parts).best(*guess)
+        if optimality is not None:
+            optimality = replace(optimality, effort=unit * optimality.effort)
         if shooting.held:
             u = np.vstack((u[:-1], u[-2]))  # the last row repeats the input of the last interval
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
@@ -220,7 +235,7 @@ def _least(search: Search) -> _Made:
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        found.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max())))
+        found.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
         if found[-1].reached and found[-1].most <= _BETWEEN:
             break
     return max(found, key=lambda made: (made.reached, -made.most))
@@ -268,6 +283,18 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
         f"last trial {listed(by) if by else 'diverges'}; {advice}"
+    )
+
+
+def _not_stationary(optimality: Optimality | None) -> str:
+    """Return the warning for a plan that reaches the goal, but may not have the least effort."""
+    if optimality is None:
+        return f"the plan reaches the goal, but {_UNKNOWN}"
+    return (
+        "the plan reaches the goal, but is not a minimum of the effort: the search ended after "
+        f"{optimality.iterations} iterations, the gradient is still {optimality.stationarity:.1e} "
+        f"of the gradient of the effort, and the complementarity is "
+        f"{optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
     )
 
 

@@ -23,6 +23,7 @@ from fflin.dynamics.coordinates import frame_of, refuse_orbit
 from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.optimality import Optimality
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ class Trajectory(Design):
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
     _note: str = field(default="", kw_only=True)  # last lines of the report; not saved in files
+    _optimality: Optimality | None = field(default=None, kw_only=True)  # not saved in files
 
     def __post_init__(self) -> None:
         robot = instance("robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one")
@@ -172,6 +174,14 @@ class Trajectory(Design):
     @cached_property
     def _aba(self) -> Aba:
         return Aba(StateMap(self.robot, frame=frame_of(self.robot, self.frame)))
+
+    @property
+    def optimality(self) -> Optimality | None:
+        """Effort and KKT residuals of a plan; see `plan`.
+
+        None if the trajectory is not the result of `plan`, or was read from a file.
+        """
+        return self._optimality
 
     @property
     def actuation(self) -> Actuation:
@@ -244,7 +254,8 @@ class Trajectory(Design):
             times = np.append(times, self.t[-1])
         q, v, _ = self.points(times)
         k, s = intervals_of(self.t, times)
-        return Trajectory._of(self, t=times, q=q, v=v, u=self._input(k, s[:, None]), _note="")
+        u = self._input(k, s[:, None])
+        return Trajectory._of(self, t=times, q=q, v=v, u=u, _note="", _optimality=None)
 
     def samples(self, dt: float) -> Array:
         """Return times from the first knot to the last, dt [s] apart."""

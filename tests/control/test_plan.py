@@ -471,6 +471,56 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     assert (left[~free] * u[~free] < -1e-3).all()
 
 
+def reduced_gradient(robot, motion, held):
+    """Return the gradient of the effort that no multipliers of the goal cancel, relative to the
+    gradient of the effort. All inputs have the same weight, and none is limited."""
+    shooting = Shooting(robot, motion.t, held)
+    shooting.steps = 64
+    nx, nu = shooting.state.nx, motion.u.shape[1]
+    ends = shooting.jacobians(motion.q, motion.v, motion.u)[0]
+    reach = np.zeros((nx, len(motion.t), nu))
+    for k, (A, B, D) in enumerate(np.split(each, (nx, nx + nu), axis=1) for each in ends):
+        reach = np.tensordot(A, reach, 1)
+        reach[:, k] += B
+        reach[:, k + 1] += D
+    share = np.ones(len(motion.t))
+    share[[0, -1]] = (1.0, 0.0) if held else (0.5, 0.5)
+    root = np.sqrt(share[share > 0.0])[:, None]
+    maps = (reach[:, share > 0.0] / root).reshape(nx, -1).T
+    u = (root * motion.u[share > 0.0]).ravel()
+    left = u - maps @ np.linalg.lstsq(maps, u, rcond=1e-12)[0]
+    return np.linalg.norm(left) / np.linalg.norm(u)
+
+
+@pytest.mark.parametrize("hold", ["previous", *exhaustive("linear")])
+def test_a_search_that_stops_early_states_its_gradient(one_joint, monkeypatch, hold):
+    robot, goal = one_joint
+    options = {"knots": 11, "limits": None, "hold": hold}
+    monkeypatch.setattr(plan_search, "_MOST", 1)
+    with any_wording(), pytest.warns(fflin.FflinWarning, match="not a minimum of the effort"):
+        motion = fflin.plan(robot, (goal, None), 10.0, **options)
+    found = motion.optimality
+    left = reduced_gradient(robot, motion, hold == "previous")
+    assert left > 0.02 and found.stationarity == pytest.approx(left, rel=1e-4)
+    assert not found.stationary and found.iterations == 1 and found.complementarity < 1e-9
+    share = np.ones(11)
+    share[[0, -1]] = (1.0, 0.0) if hold == "previous" else (0.5, 0.5)
+    assert found.effort == pytest.approx(share @ np.square(motion.u).sum(axis=1), rel=1e-9)
+    assert f"stationarity {found.stationarity:.1e}" in " ".join(str(motion).split())
+    assert motion.resampled(0.5).optimality is None
+
+
+def test_a_plan_of_the_closed_form_is_stationary(cube):
+    """The KKT residuals of a rotation about a principal axis, with and without active limits."""
+    robot, _ = cube
+    for duration in (60.0, 4.0):
+        motion = fflin.plan(robot, (turned(robot, 0.5), None), duration, knots=21)
+        found = motion.optimality
+        assert found.stationary and found.stationarity < 1e-5
+        assert found.feasibility < 1e-8 and found.complementarity < 1e-6
+        assert (np.abs(motion.u[:, 2]).max() > 1e-3 * (1.0 - 1e-9)) == (duration < 10.0)
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, Mask
 from fflin.control.optimal.shooting import Point, Shooting
+from fflin.linear.optimality import Optimality
 
 # A plan is accepted if the sum of its violations of the goal and the limits [rad, m, s] is at most
 # this.
@@ -76,6 +77,17 @@ class Trial(NamedTuple):
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
 
+class Step(NamedTuple):
+    """Steps to the solution of a quadratic program, with its multipliers."""
+
+    z: Array  # steps of the knots (N + 1, nx)
+    du: Array  # steps of the inputs (N + 1, nu)
+    gaps: Array  # multipliers of the gaps (N, nx)
+    outside: float  # sum of the violations of the goal and the limits after the step
+    gradient: Array  # of the Lagrangian before the step, with respect to the inputs (N + 1, nu)
+    complementarity: float  # sum of products of multipliers and distances from the limits
+
+
 class Search(NamedTuple):
     """Search for the inputs of least effort from a start state to an end state."""
 
@@ -94,11 +106,11 @@ class Search(NamedTuple):
     parts: int  # number of equal parts per interval; limits can apply at the end of each part
     report: Callable[[str], None]  # receives a line of text in each iteration
 
-    def best(self, q: Array, v: Array, u: Array) -> Trial:
-        """Return the trial of least effort.
+    def best(self, q: Array, v: Array, u: Array) -> tuple[Trial, Optimality | None]:
+        """Return the trial of least effort, and how nearly it is stationary.
 
         The search begins at the knots q, v and the inputs u. If the search fails, return the motion
-        under the last inputs.
+        under the last inputs, and None. The effort is the sum of ``cost * u**2``.
         """
         shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
@@ -106,6 +118,7 @@ class Search(NamedTuple):
         near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
         first, trial = near, self._trial(q, v, u)
         limited, price, left = self._exceeding(trial), 0.0 * trial.missed, list[float]()
+        iteration = 0
 
         def merit(u: Array, missed: Array, outside: float) -> float:
             lost = (price * np.abs(missed)).sum() + _PRICE * outside
@@ -115,8 +128,8 @@ class Search(NamedTuple):
             self._report(f"iteration {iteration + 1}", trial, limited)
             step = self._step(trial, limited, near, cost * trial.u, left)
             if step is None:
-                return self._flown(trial.u)
-            z, du, y, outside = step
+                return self._flown(trial.u), None
+            z, du, y, outside, *_ = step
             # Powell's rule sets the penalty on gaps from the multipliers.
             price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
             was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
@@ -133,7 +146,30 @@ class Search(NamedTuple):
             known, limited = limited, limited | self._exceeding(trial)
             if saved <= _SAVED * was and (limited == known).all():
                 break
-        return self._closed(trial, limited, first, left)
+        trial = self._closed(trial, limited, first, left)
+        return trial, self._optimality(trial, limited, first, iteration + 1)
+
+    def _optimality(
+        self, trial: Trial, limited: Mask, near: Array, iterations: int
+    ) -> Optimality | None:
+        """Return how nearly a trial is stationary, or None if its multipliers are not found."""
+        cost, u = self.cost, trial.u
+        step = self._step(trial, limited | self._exceeding(trial), 0.0 * near, cost * u, [])
+        if step is None:
+            return None
+        # The distance of the inputs from the minimum of the Lagrangian within their limits, if the
+        # curvature of the Lagrangian is the curvature of the effort.
+        least = np.clip(u - step.gradient / cost, *self.limits)
+        effort = float((cost * u**2).sum())
+        distance = float((cost * (u - least) ** 2).sum())
+        size = effort or 1.0
+        return Optimality(
+            effort=effort,
+            stationarity=(distance / size) ** 0.5,
+            feasibility=max(trial.gap, float(excess(trial.knots).max())),
+            complementarity=step.complementarity / size,
+            iterations=iterations,
+        )
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
@@ -162,11 +198,10 @@ class Search(NamedTuple):
 
     def _step(
         self, trial: Trial, limited: Mask, near: Array, effort: Array, left: list[float]
-    ) -> tuple[Array, Array, Array, float] | None:
+    ) -> Step | None:
         """Return the optimal steps of the knots and of the inputs, or None if the search fails.
 
-        The other two results are the multipliers of the gaps, and the sum of the limit violations
-        after the step. The list `left` contains the violation at the knots after each quadratic
+        `effort` is the gradient of the effort. The list `left` contains the violation at the knots after each quadratic
         program; this method appends a value. The search fails if the motion diverges, if the
         quadratic program has no solution, or if the violation does not fall (see `_STAGNANT`).
         """
@@ -194,13 +229,18 @@ class Search(NamedTuple):
         found = solve_stages(ends, trial.missed, cost, g, limits, rows, room, prices, scale)
         if found is None:
             return None
-        z, du, _ = found
-        outside = excess(room - rows @ np.hstack((z, du)).ravel()).sum()
+        z, du, gaps, multipliers = found
+        outside = float(excess(room - rows @ np.hstack((z, du)).ravel()).sum())
         left.append(float(excess(trial.knots - z).sum()))
         before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
         if min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before):
             return None
-        return *found, float(outside)
+        forces = (rows.T @ multipliers).reshape(len(u), nw)
+        gradient = effort + forces[:, nx:] + _by_costates(ends, forces[:, :nx])
+        # A goal has equal limits. Its errors count as violations.
+        slack = np.where(multipliers > 0.0, room[1], -room[0]) * (room[1] > room[0])
+        products = np.abs(multipliers) * np.where(multipliers == 0.0, 0.0, np.abs(slack))
+        return Step(z, du, gaps, outside, gradient, float(products.sum()))
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals by the smallest steps of the knots and the inputs.
@@ -229,14 +269,32 @@ class Search(NamedTuple):
             step = self._step(trial, limited, near, 0.0 * trial.u, left)
             if step is None:
                 break
-            u = np.clip(trial.u + step[1], *self.limits)
-            trial = self._trial(*shooting.moved(trial.q, trial.v, step[0]), u)
+            u = np.clip(trial.u + step.du, *self.limits)
+            trial = self._trial(*shooting.moved(trial.q, trial.v, step.z), u)
         return trial if trial.gap <= _MEETS else self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
         """Integrate the motion from the start under the inputs u, and return it as a trial."""
         trial = self._trial(*self.shooting.flown(self.start, u), u)
         return trial._replace(missed=0.0 * trial.missed)
+
+
+def _by_costates(ends: Array, forces: Array) -> Array:
+    """Return the derivative (N + 1, nu) of a function of the states with respect to the inputs.
+
+    `forces` (N + 1, nx) contains the derivative of the function with respect to the states. For
+    `ends`, see `solve_stages`.
+    """
+    N, nx, n = ends.shape
+    nu = (n - nx) // 2
+    slopes = np.zeros((N + 1, nu))
+    costate = forces[N]
+    for k in range(N - 1, -1, -1):
+        by_end = costate @ ends[k]
+        slopes[k] += by_end[nx : nx + nu]
+        slopes[k + 1] += by_end[nx + nu :]
+        costate = forces[k] + by_end[:nx]
+    return slopes
 
 
 def excess(room: Array) -> Array:
@@ -262,7 +320,7 @@ def solve_stages(
     room: Array,
     prices: Array,
     scale: Array,
-) -> tuple[Array, Array, Array] | None:
+) -> tuple[Array, Array, Array, Array] | None:
     r"""Solve a quadratic program over N stages for w = (x, u), with hard and soft limits.
 
     .. math::
@@ -278,8 +336,8 @@ def solve_stages(
     column for each entry of w. The program is scaled by `scale` (nx + nu,), the typical sizes of
     the entries of x and u.
 
-    Return x (N + 1, nx), u (N + 1, nu) and the multipliers (N, nx) of the equality constraints.
-    Return None if the program is infeasible or the solver fails.
+    Return x (N + 1, nx), u (N + 1, nu), the multipliers (N, nx) of the equality constraints, and
+    the multipliers (m,) of the soft limits, which are positive at upper limits. Return None if the program is infeasible or the solver fails.
     """
     piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
     (N, nx, _), (knots, nw), m = ends.shape, g.shape, len(prices)
@@ -318,4 +376,5 @@ def solve_stages(
     found = solver.result
     w = (found.x[: len(size)] * size).reshape(knots, nw)
     y = (unit * of_rows * found.y).reshape(knots, nx)[1:]
-    return w[:, :nx], np.clip(w[:, nx:], *limits), y
+    multipliers = unit * (found.z_u[m:] - found.z_l[:m]) if m else np.zeros(0)
+    return w[:, :nx], np.clip(w[:, nx:], *limits), y, multipliers
