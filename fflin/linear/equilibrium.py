@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
