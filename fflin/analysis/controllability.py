@@ -529,7 +529,7 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
     )
-    _conclude(InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed))
+    _conclude(InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed, spans=True))
 
 
 def _conclude(
@@ -560,11 +560,19 @@ def _root(W: Array) -> Array:
 
 
 def _reached(
-    lin: LinearModel, A: Array, B: Array, what: str, complaint: str, *, unstable: bool = False
+    lin: LinearModel,
+    A: Array,
+    B: Array,
+    what: str,
+    complaint: str,
+    *,
+    unstable: bool = False,
+    spans: bool = False,
 ) -> tuple[str, list[str], ranks.Margin]:
     """Test whether the columns of B excite every mode of A on the stability boundary.
 
-    If `unstable`, test the unstable modes as well. Return three results: an error message, or "" if
+    If `unstable`, test the unstable modes as well. If `spans`, the message names one state for each
+    mode, and not the largest states of all modes. Return three results: an error message, or "" if
     B excites all tested modes; notes on undecided ranks; and the margin of the rank decisions.
     """
     discrete = bool(lin.dt)
@@ -603,23 +611,28 @@ def _reached(
         "rounding error, so another machine may decide otherwise"
         for ratio, at, change in margin.doubts
     ]
-    words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
+    name = _spanning if spans and len(missed) > 1 else _dominant
+    words = complaint.format(name(np.array(missed), lin.state_names)) if missed else ""
     return words, doubts, margin
 
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the states on which vectors (k, nx) depend, for a message.
+    """Name the states with the largest entries in vectors (k, nx), for a message."""
+    sizes = np.abs(vectors)
+    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
+    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+    count = len(vectors)
+    if large.sum() <= count:
+        return words
+    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"
 
-    A single vector is described by its largest entries. Several vectors span a space, so they are
-    described by states that determine a vector of this space, if possible states of the base.
+
+def _spanning(vectors: Values, names: Sequence[str]) -> str:
+    """Name states that determine a vector of the space of vectors (k, nx), for a message.
+
+    They are states of the base if possible, as for the momenta of the robot.
     """
-    if len(vectors) == 1:
-        sizes = np.abs(vectors[0])
-        large = sizes >= 0.3 * sizes.max()
-        words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
-        return words if large.sum() == 1 else f"a combination of {words}"
-    parts = np.vstack((vectors.real, vectors.imag))
-    space, _ = ranks.image(parts.T, 1e-6)
+    space, _ = ranks.image(np.vstack((vectors.real, vectors.imag)).T, 1e-6)
     of_base = [not name.partition(".")[0].endswith("_m") for name in names]
     _, pivots = ranks.echelon(space, np.ones(len(names)), np.array(of_base))
     return listed(names[i] for i in pivots)

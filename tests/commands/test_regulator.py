@@ -96,7 +96,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "eigenvalue 0": ("--r", "F_b.y=0"),
         "-1 s": ("--sample", "-1"),
         "q_b.x": ("--velocity", "omega_b.x=0.1"),
-        "--equilibrium": ("--gravity", "0", "0", "-9.81", "--q", "q_b=1"),
+        "cannot balance": ("--gravity", "0", "0", "-9.81", "--inputs", "joints"),
         "--q": ("--q", "q_b=1", "--q", "q_b=2"),
     }.items():
         code, out, err = run(capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz"))
