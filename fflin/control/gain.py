@@ -406,8 +406,8 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
         return float(np.linalg.norm(response, 2)), frequency
 
     poles = np.linalg.eigvals(A)
-    frequencies = sorted({0.0, *np.abs(poles).tolist()})
-    found = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, frequencies))
+    starts = sorted({0.0, *np.abs(poles).tolist()})
+    found = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, starts))
     while True:
         bound = found[0] * (1.0 + ACCURACY)
         crossings, on_axis = gain_crossings(A, B, C, D, bound)

@@ -27,7 +27,8 @@ _ROWS = 4096
 
 # A number for each row (N,), or one number for all rows.
 Number: TypeAlias = Any
-Vector: TypeAlias = Sequence[Number]
+# Three numbers, or an array (3, N).
+Vector: TypeAlias = Any
 # The x, y and z axes of a frame, in base axes.
 Axes: TypeAlias = Sequence[Vector]
 
@@ -206,13 +207,14 @@ def _sums(robot: Robot, bodies: list[_Body], q: Array, v: Array) -> Integrals:
         position = _plus(_turned(root.rotation.T, position), root.translation)
     center = _plus(position, _turned(axes, center))
     polar += total * _dot(center, center)
-    momentum = np.array([*_turned(axes, linear), *_turned(axes, spin)])
-    return Integrals(energy, momentum.T, np.array(center).T, polar)
+    total_momentum = np.array([*_turned(axes, linear), *_turned(axes, spin)])
+    return Integrals(energy, total_momentum.T, np.array(center).T, polar)
 
 
 def _moved(above: _Motion, body: _Body, q: Array, v: Array) -> _Motion:
     """Return the motion of a body from the motion of its parent."""
     joint, screw, place = body.joint, body.screw, body.place
+    axes: Axes
     x, y, z = (_turned(above.axes, column) for column in place.rotation.T)
     shift = _turned(above.axes, place.translation)
     angular = above.angular

@@ -45,6 +45,8 @@ _FRACTION, _COMPILING = 0.1, 30.0
 # length of a part is at most _PART divided by the fastest pole, which changes the damping of an
 # oscillation by less than 1e-7 of its frequency.
 _PART = 0.1
+# A linear prediction makes blocks of 2**_DOUBLINGS steps; see `_affine_motion`.
+_DOUBLINGS = 8
 
 _SMALL = 1e-6  # deviation from the target at which limits do not act, to find the poles of a loop
 
@@ -484,22 +486,32 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
 
 def _affine_motion(A: Array, f0: Array, e: Array, steps: int, every: int) -> Array:
     """Return e before every `every`-th of the steps e -> A e + f0, and e after the last step."""
-    size, count = len(e), -(-steps // every)
+    # In a block of steps, the first rows times a power of the step are the next rows, so the number
+    # of rows doubles each time. All steps are made whatever `every` is, so that the rows of a
+    # thinned run are rows of the full run bit for bit.
+    size = len(e)
     step = np.zeros((size + 1, size + 1))
     step[:size, :size] = A
     step[:size, size] = f0
     step[size, size] = 1.0
-    # The first rows times a power of the step are the next rows, so their number doubles each time.
-    rows = np.empty((count + 1, size + 1))
-    rows[0] = np.append(e, 1.0)
-    filled, power = 1, np.linalg.matrix_power(step, every)
-    while filled < count:
-        added = min(filled, count - filled)
-        rows[filled : filled + added] = rows[:added] @ power.T
-        filled, power = filled + added, power @ power
-    left = steps - every * (count - 1)
-    rows[count] = np.linalg.matrix_power(step, left) @ rows[count - 1]
-    return rows[:, :size]
+    powers = [step]
+    for _ in range(_DOUBLINGS):
+        powers.append(powers[-1] @ powers[-1])
+    block = 2**_DOUBLINGS
+    rows = np.empty((block, size + 1))
+    first = np.append(e, 1.0)
+    kept: list[Array] = []
+    for begin in range(0, steps + 1, block):
+        rows[0] = first
+        for doubling in range(_DOUBLINGS):
+            filled = 2**doubling
+            rows[filled : 2 * filled] = rows[:filled] @ powers[doubling].T
+        first = powers[-1] @ rows[0]
+        end = min(block, steps - begin)
+        kept.append(rows[-begin % every : end : every].copy())
+        if steps < begin + block:
+            kept.append(rows[end : end + 1].copy())
+    return np.concatenate(kept)[:, :size]
 
 
 def _runge_kutta(rate: Callable[[Array], Array], e: Array, h: float) -> Array:

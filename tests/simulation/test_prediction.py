@@ -109,7 +109,10 @@ def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is
         assert np.abs(run.linear - run.x).max() < 1e-3 * moved
 
 
-@pytest.mark.parametrize("steps, every", [(1, 1), (64, 1), (100, 7), (98, 7), (5, 9)])
+@pytest.mark.parametrize(
+    "steps, every",
+    [(1, 1), (64, 1), (100, 7), (98, 7), (5, 9), (255, 1), (256, 1), (700, 7), (1030, 300)],
+)
 def test_the_motion_of_a_linear_loop_is_that_of_its_single_steps(steps, every):
     rng = np.random.default_rng(4)
     A = 0.99 * np.linalg.qr(rng.normal(size=(5, 5)))[0]
