@@ -452,7 +452,7 @@ class Campaign(FrozenArrays):
             If pandas is not installed.
         """
         columns, rows = self._table()
-        runs = np.column_stack((np.arange(len(rows)), rows))
+        runs = np.column_stack((np.arange(len(rows), dtype=float), rows))
         return data_frame(["run", *columns], runs, index="run")
 
     def _save(self, path: Path, **texts: str) -> None:
