@@ -374,7 +374,7 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
 
 
 def unpushed_positions(lin: LinearModel) -> Indices:
-    """Return the indices (k,) of the base positions that no input pushes.
+    """Return the indices (k,) of the base positions that no input pushes, directly or by tilting.
 
     The result is empty if these positions or their rates affect any other state.
     """
@@ -384,7 +384,11 @@ def unpushed_positions(lin: LinearModel) -> Indices:
         return np.zeros(0, dtype=np.intp)
     source = lin.generator or lin
     driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
-    base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
+    # A base that hovers is pushed along an axis if it tilts, because the momentum then changes.
+    accelerations = source.A[nv:]
+    force, size = source.M @ accelerations, np.abs(source.M) @ np.abs(accelerations)
+    steered = (np.abs(force) > _ROUNDING * size).any(axis=1)
+    base = np.array([i for i in positions if not (driven[i] or steered[i])], dtype=np.intp)
     columns = np.concatenate((base, base + nv))
     on_others = np.delete(source.A[:, columns], columns, axis=0)
     if np.abs(on_others).max(initial=0.0) > _ROUNDING:

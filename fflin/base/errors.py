@@ -146,7 +146,8 @@ class EquilibriumError(FflinError, ValueError):
 
     Examples
     --------
-    >>> robot = fflin.load("planar_detumble", gravity=(0, 0, -9.81))
+    >>> inputs = [fflin.BaseTorque(), fflin.JointTorque("*")]
+    >>> robot = fflin.load("planar_detumble", gravity=(0, 0, -9.81), inputs=inputs)
     >>> fflin.lqr(fflin.linearize(robot))
     Traceback (most recent call last):
         ...
@@ -164,11 +165,11 @@ class StabilizabilityError(FflinError, ValueError):
 
     Examples
     --------
-    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseForce()])
     >>> fflin.lqr(fflin.linearize(robot))
     Traceback (most recent call last):
         ...
-    fflin.base.errors.StabilizabilityError: the inputs cannot stabilise linear momentum ...
+    fflin.base.errors.StabilizabilityError: the inputs cannot stabilise angular momentum ...
     """
 
     margin: object = None

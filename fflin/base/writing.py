@@ -48,15 +48,24 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
         raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}")
 
 
-def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
-    """Return the content of a regular file of at most `limit` bytes, or raise `FileError`."""
-    require_regular(path, kind, limit)
+def read_file(
+    path: Path, kind: str, limit: int | None = None, *, replaceable: bool = False
+) -> bytes:
+    """Return the content of a regular file of at most `limit` bytes, or raise `FileError`.
+
+    If `replaceable`, the file is not registered as an input, so that it can be overwritten.
+    """
+    require_regular(path, kind, limit, replaceable=replaceable)
     with failing(path, "read"), path.open("rb") as file:
         return file.read(-1 if limit is None else limit)
 
 
-def require_regular(path: Path, kind: str, limit: int | None = None) -> None:
+def require_regular(
+    path: Path, kind: str, limit: int | None = None, *, replaceable: bool = False
+) -> None:
     """Register an input file that another package reads, or raise `FileError`.
+
+    If `replaceable`, the file is only checked.
 
     The file must be a regular file of at most `limit` bytes. Other files are not opened: a pipe
     would block until another process writes into it, and a device may have no end.
@@ -69,7 +78,8 @@ def require_regular(path: Path, kind: str, limit: int | None = None) -> None:
     if limit is not None and found.st_size > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
-    remember(path)
+    if not replaceable:
+        remember(path)
 
 
 @contextmanager

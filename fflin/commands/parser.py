@@ -259,7 +259,8 @@ FORMS: dict[str, Form] = {
     "engine": {"choices": ("compiled", "python")},
     "scene": {"choices": ("space", "lab")},
     "for": {
-        "choices": ("drake", "mujoco", "pinocchio", "crocoddyl", "spart", "euler", "euler_rates")
+        "choices": ("drake", "mujoco", "pinocchio", "crocoddyl", "spart", "euler", "euler_rates"),
+        "metavar": "TOOL",
     },
     "real": {"choices": ("double", "float"), "default": "double"},
     **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),

@@ -35,8 +35,9 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
+_LARGEST = 2**26  # [bytes] largest size of each file of a law
+
 # Valid names, without those of headers that the code or the C library includes.
-_LARGEST = 2**26  # of each file of a law [bytes]
 _NAME = r"(?!(features|float|math|std\w*)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 
@@ -152,9 +153,11 @@ def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
 def _description(path: Path) -> dict[str, Any]:
     """Return the description of C code, or raise `FileError` if a file was edited."""
     with reading(path, "description of C code"):
-        about: dict[str, Any] = json.loads(read_file(path, ".json", _LARGEST))
-        header = read_file(path.with_suffix(".h"), "C header", _LARGEST)
-        code = read_file(path.with_suffix(".c"), "C", _LARGEST)
+        # A later call may write the code again.
+        read = partial(read_file, limit=_LARGEST, replaceable=True)
+        about: dict[str, Any] = json.loads(read(path, ".json"))
+        header = read(path.with_suffix(".h"), "C header")
+        code = read(path.with_suffix(".c"), "C")
         if about.pop("sha256") != digest_of(about, header, code):
             raise FileError(
                 f"{path}: does not belong to its .c and .h files, or one of these files was "

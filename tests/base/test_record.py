@@ -348,7 +348,7 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
     [
         (b"# Created by Octave 7.3.0\n# name: A\n# type: matrix\n", "Octave's own format"),
         (b"Octave-1-L", "Octave's own format"),
-        (b"\x89HDF\r\n\x1a\n", "HDF5"),
+        (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
     ],
 )
 def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(tmp_path, content, format_):

@@ -446,7 +446,8 @@ def test_warnings_of_other_packages_are_shown_as_those_of_fflin(monkeypatch, cap
 def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
     code, out, err = run("info", "servicer_7dof", "--inputs", "servicer_7dof")
     assert code == 0 and not err and "9 joints, 30 states, 17 inputs" in out
-    rows = [line.split() for line in out.split("\ninput ")[1].splitlines()[1:]]
+    table, _, _ = out.split("\ninput ")[1].partition("\n\n")
+    rows = [line.split() for line in table.splitlines()[1:]]
     limits = {row[0]: (row[-2], row[-1]) for row in rows}
     model = fflin.load("servicer_7dof").model
     effort = dict(zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True))
@@ -608,7 +609,7 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
 
 
 def test_options_that_repeat_a_robot_file_are_in_one_group():
-    repeated = {"lock", "orbit", "stiffness", "damping", "gravity", "passive", "inputs", "output"}
+    repeated = {"lock", "xacro", "orbit", "stiffness", "damping", "gravity", "passive", "inputs", "output"}
     (parsers,) = cli._parser("")._subparsers._group_actions
     for name in ("linearize", "check", "lqr", "simulate", "sweep", "montecarlo", "funnel"):
         (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)

@@ -107,7 +107,7 @@ def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_un
     assert apart < 1e-3
     lines = out.splitlines()
     at = next(i for i, line in enumerate(lines) if line.startswith("largest inputs"))
-    until = next(i for i, line in enumerate(lines) if line.startswith("energy"))
+    until = next(i for i, line in enumerate(lines) if line.startswith("thrusters"))
     inputs = [part for line in lines[at:until] for part in line.split(", ")]
     assert all(part.rstrip(",").endswith((" N", " N m")) for part in inputs)
     assert "e-1" not in " ".join(inputs)  # what is rounding is none of the largest
