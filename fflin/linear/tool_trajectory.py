@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from fflin.linear.tool_coordinates import ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.control.tvlqr import GainSchedule
     from fflin.linear.linear_trajectory import LinearTrajectory
+    from fflin.linear.trajectory import Trajectory
 
 # Tools whose errors along a trajectory are a constant matrix times the errors of fflin, because
 # both are in the axes of the moving base.
@@ -168,7 +168,21 @@ def tool_trajectory(traj: LinearTrajectory, tool: str, dt: float | None) -> Tool
     )
 
 
-def tool_schedule(schedule: GainSchedule, tool: str, robot: Robot) -> ToolSchedule:
+class Schedule(Protocol):
+    """Gains along a trajectory, of which `GainSchedule` is the only class."""
+
+    t: Array
+    K: Array
+    dt: float
+    robot: str
+    verified: bool
+
+    def trajectory(self, robot: Robot) -> Trajectory:
+        """Return the trajectory of the gains."""
+        ...
+
+
+def tool_schedule(schedule: Schedule, tool: str, robot: Robot) -> ToolSchedule:
     """Convert the gains along a trajectory; see `GainSchedule.to`."""
     change, traj = _Change(robot, tool), schedule.trajectory(robot)
     times = schedule.t
