@@ -387,7 +387,7 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     # A base that hovers is pushed along an axis if it tilts, because the momentum then changes.
     accelerations = source.A[nv:]
     force, size = source.M @ accelerations, np.abs(source.M) @ np.abs(accelerations)
-    steered = (np.abs(force) > _ROUNDING * size).any(axis=1)
+    steered = np.count_nonzero(np.abs(force) > _ROUNDING * size, axis=1)
     base = np.array([i for i in positions if not (driven[i] or steered[i])], dtype=np.intp)
     columns = np.concatenate((base, base + nv))
     on_others = np.delete(source.A[:, columns], columns, axis=0)

@@ -171,11 +171,25 @@ def tool_trajectory(traj: LinearTrajectory, tool: str, dt: float | None) -> Tool
 class Schedule(Protocol):
     """Gains along a trajectory, of which `GainSchedule` is the only class."""
 
-    t: Array
-    K: Array
-    dt: float
-    robot: str
-    verified: bool
+    @property
+    def t(self) -> Array:
+        """Times [s] of the knots (N,)."""
+
+    @property
+    def K(self) -> Array:
+        """Gains (N, nu, nx) at the knots."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]; 0 if the gains are continuous."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+
+    @property
+    def verified(self) -> bool:
+        """Whether the digest of a file was checked."""
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory of the gains."""
