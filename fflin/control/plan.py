@@ -1,7 +1,7 @@
 """Trajectory planning: low-effort motions between two states within limits."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -57,9 +57,10 @@ def plan(
     The plan minimises :math:`\int u^T R\,u\;dt`. Inputs, joints and wheels stay within their
     limits. The method is multiple shooting: the state at the start of each interval is an
     optimisation variable. Sequential quadratic programming searches for a local minimum in at most
-    50 iterations. The search ends earlier if the violation of the goal and the limits at the knots
-    is above 0.01 and does not fall by a tenth in ten iterations. The quadratic programs are built
-    from the linear models along the motion and solved by PIQP (``pip install 'fflin[mpc]'``).
+    100 iterations. The search ends earlier at a stationary point, or if the violation of the goal
+    and the limits at the knots is above 0.01 and does not fall by a tenth in ten iterations. The
+    quadratic programs are built from the linear models along the motion and solved by PIQP (``pip
+    install 'fflin[mpc]'``). Second-order corrections allow long steps.
 
     ``motion.optimality`` contains the residuals of the Karush-Kuhn-Tucker conditions at the plan,
     and `print` shows them. If the plan is not stationary, a warning states how large the gradient
@@ -182,14 +183,10 @@ def plan(
         if asked.all():
             q[-1], v[-1] = end  # the integrated motion misses it by at most _REACHED
         note = _note(shooting, made)
-        if made.most > _BETWEEN:
-            warnings.warn(
-                f"{note}; give more knots or a longer duration", FflinWarning, stacklevel=2
-            )
+        for text in _faults(made, note):
+            warnings.warn(text, FflinWarning, stacklevel=2)
         note += f"\n{made.optimality or _UNKNOWN}"
         note += _largest(shooting, actuation, made, np.hstack((bounds, inputs)))
-        if made.optimality is None or not made.optimality.stationary:
-            warnings.warn(_not_stationary(made.optimality), FflinWarning, stacklevel=2)
         return Trajectory(robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality)
     raise _failure(shooting, made, asked, duration)
 
@@ -286,16 +283,20 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     )
 
 
-def _not_stationary(optimality: Optimality | None) -> str:
-    """Return the warning for a plan that reaches the goal, but may not have the least effort."""
+def _faults(made: _Made, note: str) -> Iterator[str]:
+    """Return warnings about a plan that exceeds a limit, or may not have the least effort."""
+    if made.most > _BETWEEN:
+        yield f"{note}; give more knots or a longer duration"
+    optimality = made.optimality
     if optimality is None:
-        return f"the plan reaches the goal, but {_UNKNOWN}"
-    return (
-        "the plan reaches the goal, but is not a minimum of the effort: the search ended after "
-        f"{optimality.iterations} iterations, the gradient is still {optimality.stationarity:.1e} "
-        f"of the gradient of the effort, and the complementarity is "
-        f"{optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
-    )
+        yield f"the plan reaches the goal, but {_UNKNOWN}"
+    elif not optimality.stationary:
+        yield (
+            "the plan reaches the goal, but is not a minimum of the effort: the search ended after "
+            f"{optimality.iterations} iterations, the gradient is still "
+            f"{optimality.stationarity:.1e} of the gradient of the effort, and the complementarity "
+            f"is {optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
+        )
 
 
 def _note(shooting: Shooting, made: _Made) -> str:

@@ -33,11 +33,21 @@ _NEARLY = 1e-3
 # while the gaps are closed.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
-# The search ends after _MOST iterations. It ends earlier if an iteration adds no limit within the
-# intervals and the predicted reduction of the merit function is at most _SAVED times its value.
-# The line search tries at most _MOST_HALVINGS step lengths. The gaps are closed in at most
-# _MOST_CLOSING iterations.
-_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
+# The search ends after _MOST iterations, or if _MOST_TRIES steps fail to reduce the merit function.
+# It ends earlier if an iteration adds no limit within the intervals, the predicted reduction of the
+# merit function is at most _SAVED times its value, and the stationarity is at most _STATIONARY. The
+# gaps are closed in at most _MOST_CLOSING iterations.
+_SAVED, _STATIONARY, _MOST, _MOST_TRIES, _MOST_CLOSING = 1e-6, 1e-3, 100, 8, 20
+
+# A step is corrected up to _MOST_CORRECTIONS times, until the merit function falls by _ENOUGH times
+# the predicted reduction. It is accepted if the merit function falls by _SOME times the predicted
+# reduction. A step that is not predicted to reach the goal is not corrected.
+_MOST_CORRECTIONS, _ENOUGH, _SOME = 4, 0.5, 0.1
+
+# The Levenberg-Marquardt cost is multiplied by _LESS after a step that reduces the merit function
+# by _ENOUGH, and by _MORE after a step that fails. It is at least _LEAST times its first value,
+# because the solver may fail without it.
+_LESS, _MORE, _LEAST = 0.2, 4.0, 1e-6
 
 # Levenberg-Marquardt cost of a step of the wheel angles and rates, relative to this cost for the
 # other states. It is small, because wheels may turn far and fast.
@@ -77,6 +87,21 @@ class Trial(NamedTuple):
         return float(excess(self.knots).sum() + excess(self.inside)[limited].sum())
 
 
+class Models(NamedTuple):
+    """Linear models along a trial, and its limits as rows of the quadratic program."""
+
+    ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
+    rows: sp.csr_array  # one row for each limit
+    at_knots: tuple[Array, ...]  # knot and state of the first rows
+    within: tuple[Array, ...]  # interval, part and state of the other rows
+
+    def room(self, trial: Trial) -> Array:
+        """Return the lower and upper limits (2, m) of the rows about a trial."""
+        at_knots = trial.knots[(slice(None), *self.at_knots)]
+        room: Array = np.hstack((at_knots, trial.inside[(slice(None), *self.within)]))
+        return room
+
+
 class Step(NamedTuple):
     """Steps to the solution of a quadratic program, with its multipliers."""
 
@@ -86,14 +111,17 @@ class Step(NamedTuple):
     outside: float  # sum of the violations of the goal and the limits after the step
     gradient: Array  # of the Lagrangian before the step, with respect to the inputs (N + 1, nu)
     complementarity: float  # sum of products of multipliers and distances from the limits
+    moved: Array  # displacements of the rows of the limits (m,)
 
 
 class Search(NamedTuple):
     """Search for the inputs of least effort from a start state to an end state."""
 
     # The Hessian is the Gauss-Newton approximation. As in the Levenberg-Marquardt method, a step of
-    # the states has an additional cost, which is reduced after a full step and raised after a short
-    # step.
+    # the states has an additional cost, which is reduced after a step that keeps its promise and
+    # raised after a step that does not. The linear models miss the curvature of the motion, so that
+    # a long step opens gaps. Second-order corrections close them; without them, the merit function
+    # would only accept short steps (Maratos effect).
 
     shooting: Shooting
     start: Point
@@ -119,32 +147,35 @@ class Search(NamedTuple):
         first, trial = near, self._trial(q, v, u)
         limited, price, left = self._exceeding(trial), 0.0 * trial.missed, list[float]()
         iteration = 0
-
-        def merit(u: Array, missed: Array, outside: float) -> float:
-            lost = (price * np.abs(missed)).sum() + _PRICE * outside
-            return float((cost * u * u).sum() / 2.0 + lost)
-
         for iteration in range(_MOST):
             self._report(f"iteration {iteration + 1}", trial, limited)
-            step = self._step(trial, limited, near, cost * trial.u, left)
-            if step is None:
+            models = self._models(trial, limited)
+            if models is None:
                 return self._flown(trial.u), None
-            z, du, y, outside, *_ = step
-            # Powell's rule sets the penalty on gaps from the multipliers.
-            price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
-            was, fraction = merit(trial.u, trial.missed, trial.outside(limited)), 1.0
-            saved = was - merit(trial.u + du, 0.0 * trial.missed, outside)
-            for _ in range(_MOST_HALVINGS):
-                new = np.clip(trial.u + fraction * du, *self.limits)
-                there = self._trial(*shooting.moved(trial.q, trial.v, fraction * z), new)
-                after = merit(new, there.missed, there.outside(limited))
-                if was - after >= 1e-4 * fraction * saved:
-                    trial = there
+            moved = None
+            for attempt in range(_MOST_TRIES):
+                step = self._step(trial, models, near, cost * trial.u)
+                if attempt == 0 and (step is None or self._is_hopeless(trial, step, left)):
+                    return self._flown(trial.u), None
+                if step is None:
                     break
-                fraction *= 0.5
-            near = near * (0.2 if fraction == 1.0 else 1.0 if fraction > 0.25 else 3.0)
+                # Powell's rule sets the penalty on gaps from the multipliers.
+                y = np.abs(step.gaps)
+                price = np.maximum(y, 0.5 * (price + y))
+                saved = self._merit(trial, price, limited) - self._promised(trial, step)
+                moved, gain = self._corrected(trial, models, near, step, price, limited, saved)
+                if moved is not None:
+                    break
+                near = _MORE * near
+            if moved is None:
+                break
+            if gain >= _ENOUGH * saved:
+                near = np.maximum(_LESS * near, _LEAST * first)
+            before = self._merit(trial, price, limited)
+            stationary = self._stationarity(trial.u, step.gradient) <= _STATIONARY
+            trial = moved
             known, limited = limited, limited | self._exceeding(trial)
-            if saved <= _SAVED * was and (limited == known).all():
+            if saved <= _SAVED * before and stationary and (limited == known).all():
                 break
         trial = self._closed(trial, limited, first, left)
         return trial, self._optimality(trial, limited, first, iteration + 1)
@@ -153,23 +184,80 @@ class Search(NamedTuple):
         self, trial: Trial, limited: Mask, near: Array, iterations: int
     ) -> Optimality | None:
         """Return how nearly a trial is stationary, or None if its multipliers are not found."""
-        cost, u = self.cost, trial.u
-        step = self._step(trial, limited | self._exceeding(trial), 0.0 * near, cost * u, [])
+        models = self._models(trial, limited | self._exceeding(trial))
+        if models is None:
+            return None
+        step = self._step(trial, models, 0.0 * near, self.cost * trial.u)
         if step is None:
             return None
-        # The distance of the inputs from the minimum of the Lagrangian within their limits, if the
-        # curvature of the Lagrangian is the curvature of the effort.
-        least = np.clip(u - step.gradient / cost, *self.limits)
-        effort = float((cost * u**2).sum())
-        distance = float((cost * (u - least) ** 2).sum())
-        size = effort or 1.0
+        effort = float((self.cost * trial.u**2).sum())
         return Optimality(
             effort=effort,
-            stationarity=(distance / size) ** 0.5,
+            stationarity=self._stationarity(trial.u, step.gradient),
             feasibility=max(trial.gap, float(excess(trial.knots).max())),
-            complementarity=step.complementarity / size,
+            complementarity=step.complementarity / (effort or 1.0),
             iterations=iterations,
         )
+
+    def _stationarity(self, u: Array, gradient: Array) -> float:
+        """Return the relative distance of the inputs from the minimum of the Lagrangian.
+
+        The minimum is within the limits of the inputs. The curvature of the Lagrangian is taken as
+        the curvature of the effort.
+        """
+        least = np.clip(u - gradient / self.cost, *self.limits)
+        distance = float((self.cost * (u - least) ** 2).sum())
+        return (distance / (float((self.cost * u**2).sum()) or 1.0)) ** 0.5
+
+    def _merit(self, trial: Trial, price: Array, limited: Mask) -> float:
+        """Return the effort plus the costs of the gaps and the violations of a trial."""
+        effort = float((self.cost * trial.u**2).sum()) / 2.0
+        gaps = float((price * np.abs(trial.missed)).sum())
+        return effort + gaps + _PRICE * trial.outside(limited)
+
+    def _promised(self, trial: Trial, step: Step) -> float:
+        """Return the merit function after a step, according to the linear models."""
+        return float((self.cost * (trial.u + step.du) ** 2).sum()) / 2.0 + _PRICE * step.outside
+
+    def _corrected(
+        self,
+        trial: Trial,
+        models: Models,
+        near: Array,
+        step: Step,
+        price: Array,
+        limited: Mask,
+        saved: float,
+    ) -> tuple[Trial | None, float]:
+        """Return the trial after a step and its corrections, and how much the merit function falls.
+
+        Return None if the merit function does not fall enough, compared with the predicted
+        reduction `saved`.
+        """
+        # A correction solves the quadratic program again, with the gaps and violations at the end
+        # of the step added to the models.
+        before, missed, effort = (
+            self._merit(trial, price, limited),
+            trial.missed,
+            self.cost * trial.u,
+        )
+        best, most = None, -np.inf
+        corrections = _MOST_CORRECTIONS if step.outside <= _HOPELESS else 0
+        for correction in range(1 + corrections):
+            u = np.clip(trial.u + step.du, *self.limits)
+            end = self._trial(*self.shooting.moved(trial.q, trial.v, step.z), u)
+            gain = before - self._merit(end, price, limited)
+            if gain >= _SOME * saved and gain > most:
+                best, most = end, gain
+            if gain >= _ENOUGH * saved or not np.isfinite(gain) or correction == corrections:
+                break
+            missed = missed + end.missed
+            room = models.room(end) + step.moved
+            again = self._step(trial, models, near, effort, missed, room)
+            if again is None:
+                break
+            step = again
+        return best, most
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
@@ -196,51 +284,70 @@ class Search(NamedTuple):
         near[:, :-1] |= beyond[:, 1:]
         return near
 
-    def _step(
-        self, trial: Trial, limited: Mask, near: Array, effort: Array, left: list[float]
-    ) -> Step | None:
-        """Return the optimal steps of the knots and of the inputs, or None if the search fails.
-
-        `effort` is the gradient of the effort. The list `left` contains the violation at the knots after each quadratic
-        program; this method appends a value. The search fails if the motion diverges, if the
-        quadratic program has no solution, or if the violation does not fall (see `_STAGNANT`).
-        """
-        u, nx = trial.u, self.shooting.state.nx
+    def _models(self, trial: Trial, limited: Mask) -> Models | None:
+        """Return the linear models along a trial, or None if the motion diverges."""
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
-            ends, inside = self.shooting.jacobians(trial.q, trial.v, u, self.parts)
+            ends, inside = self.shooting.jacobians(trial.q, trial.v, trial.u, self.parts)
         except InputError:  # the motion has diverged
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
         # x[k], u[k] and u[k + 1].
-        nw, (knot, limit) = nx + u.shape[1], np.nonzero(np.isfinite(trial.knots).any(axis=0))
-        at_knots = sp.eye_array(len(u) * nw, format="csr")[knot * nw + limit]
+        (knots, nu), nx = trial.u.shape, self.shooting.state.nx
+        nw = nx + nu
+        knot, limit = np.nonzero(np.isfinite(trial.knots).any(axis=0))
+        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + limit]
         k, part, state = np.nonzero(limited)
         columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
         starts = np.arange(len(k) + 1) * columns.shape[1]
         entries = inside[k, part, state].ravel(), columns.ravel(), starts
-        rows = sp.vstack((at_knots, sp.csr_array(entries, (len(k), len(u) * nw))))
-        room = np.hstack((trial.knots[:, knot, limit], trial.inside[:, k, part, state]))
+        rows = sp.vstack((at_knots, sp.csr_array(entries, (len(k), knots * nw))), format="csr")
+        return Models(ends, rows, (knot, limit), (k, part, state))
+
+    def _step(
+        self,
+        trial: Trial,
+        models: Models,
+        near: Array,
+        effort: Array,
+        missed: Array | None = None,
+        room: Array | None = None,
+    ) -> Step | None:
+        """Return the optimal steps of the knots and of the inputs, or None if there are none.
+
+        `effort` is the gradient of the effort. The gaps `missed` and the distances `room` from the
+        limits are by default those of the trial.
+        """
+        u, nx, ends, rows = trial.u, len(near), models.ends, models.rows
+        missed = trial.missed if missed is None else missed
+        room = models.room(trial) if room is None else room
         prices, of_x = np.full(room.shape[1], _PRICE), np.zeros((len(u), nx))
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
-        found = solve_stages(ends, trial.missed, cost, g, limits, rows, room, prices, scale)
+        found = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
         if found is None:
             return None
         z, du, gaps, multipliers = found
-        outside = float(excess(room - rows @ np.hstack((z, du)).ravel()).sum())
-        left.append(float(excess(trial.knots - z).sum()))
-        before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
-        if min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before):
-            return None
-        forces = (rows.T @ multipliers).reshape(len(u), nw)
+        moved = rows @ np.hstack((z, du)).ravel()
+        outside = float(excess(room - moved).sum())
+        forces = (rows.T @ multipliers).reshape(len(u), -1)
         gradient = effort + forces[:, nx:] + _by_costates(ends, forces[:, :nx])
         # A goal has equal limits. Its errors count as violations.
         slack = np.where(multipliers > 0.0, room[1], -room[0]) * (room[1] > room[0])
         products = np.abs(multipliers) * np.where(multipliers == 0.0, 0.0, np.abs(slack))
-        return Step(z, du, gaps, outside, gradient, float(products.sum()))
+        return Step(z, du, gaps, outside, gradient, float(products.sum()), moved)
+
+    def _is_hopeless(self, trial: Trial, step: Step, left: list[float]) -> bool:
+        """Return whether the violation at the knots does not fall, see `_STAGNANT`.
+
+        The list `left` contains the predicted violation after each quadratic program; this method
+        appends a value.
+        """
+        left.append(float(excess(trial.knots - step.z).sum()))
+        before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
+        return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
         """Close the gaps between intervals by the smallest steps of the knots and the inputs.
@@ -266,8 +373,11 @@ class Search(NamedTuple):
                 if not last <= 0.5 * before:
                     return trial
                 trial = one
-            step = self._step(trial, limited, near, 0.0 * trial.u, left)
-            if step is None:
+            models = self._models(trial, limited)
+            if models is None:
+                break
+            step = self._step(trial, models, near, 0.0 * trial.u)
+            if step is None or self._is_hopeless(trial, step, left):
                 break
             u = np.clip(trial.u + step.du, *self.limits)
             trial = self._trial(*shooting.moved(trial.q, trial.v, step.z), u)
@@ -337,7 +447,8 @@ def solve_stages(
     the entries of x and u.
 
     Return x (N + 1, nx), u (N + 1, nu), the multipliers (N, nx) of the equality constraints, and
-    the multipliers (m,) of the soft limits, which are positive at upper limits. Return None if the program is infeasible or the solver fails.
+    the multipliers (m,) of the soft limits, which are positive at upper limits. Return None if the
+    program is infeasible or the solver fails.
     """
     piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
     (N, nx, _), (knots, nw), m = ends.shape, g.shape, len(prices)
