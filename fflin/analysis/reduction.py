@@ -383,12 +383,15 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     if not positions:
         return np.zeros(0, dtype=np.intp)
     source = lin.generator or lin
-    driven = np.count_nonzero(mechanics.second_order(source).S.values, axis=1)
-    # A base that hovers is pushed along an axis if it tilts, because the momentum then changes.
-    accelerations = source.A[nv:]
-    force, size = source.M @ accelerations, np.abs(source.M) @ np.abs(accelerations)
-    steered = np.count_nonzero(np.abs(force) > _ROUNDING * size, axis=1)
-    base = np.array([i for i in positions if not (driven[i] or steered[i])], dtype=np.intp)
+    forces = mechanics.second_order(source).S.values
+    driven = np.count_nonzero(forces, axis=1)
+    base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
+    # If the inputs hold the base against gravity, they push it in all directions, because a tilt of
+    # the base turns their force.
+    force = forces[positions] @ source.u0
+    size = np.abs(forces[positions]) @ np.abs(source.u0)
+    if np.count_nonzero(np.abs(force) > _ROUNDING * size):
+        return base[:0]
     columns = np.concatenate((base, base + nv))
     on_others = np.delete(source.A[:, columns], columns, axis=0)
     if np.abs(on_others).max(initial=0.0) > _ROUNDING:
