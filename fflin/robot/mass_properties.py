@@ -34,6 +34,9 @@ _SYMMETRIC = 1e-9
 # relative rounding error of a principal moment of inertia, and of a second moment.
 _ROUNDING, _NO_MOMENT = 1e-9, 1e-12
 
+# Least number of joints without mass between the root and the first body that count as virtual.
+_FEWEST_VIRTUAL = 3
+
 # In `idle_coordinates`, singular values below this fraction of the largest one count as zero. The
 # fraction is above the rounding errors of about 1e-15, and below the smallest nonzero value of
 # about 1e-7, which occurs for links that are 1e7 m apart.
@@ -389,10 +392,33 @@ def massless_note(robot: Robot) -> str:
             "the effective mass of modes is the whole mass of their link in some direction, so "
             "give the link more inertia, or the modes less participation"
         )
+    virtual = _virtual_joints(robot)
+    if virtual:
+        advice = (
+            f"the joints {', '.join(virtual)} seem to stand for the free motion of the base, which "
+            f"fflin adds by itself: lock them, as in lock={virtual}"
+        )
     return (
         f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
         f"without moving mass; {advice}"
     )
+
+
+def _virtual_joints(robot: Robot) -> list[str]:
+    """Return the joints of a chain without mass from the root to the first body, if it is long.
+
+    Some URDFs describe a floating base by such joints. A chain of at least three joints counts.
+    """
+    model = robot._bare.model
+    chain = list[str]()
+    body = ROOT
+    while model.inertias[body].mass == 0.0:
+        children = [i for i in range(body + 1, model.njoints) if model.parents[i] == body]
+        if len(children) != 1:
+            return []
+        body = children[0]
+        chain.append(model.names[body])
+    return chain if len(chain) >= _FEWEST_VIRTUAL else []
 
 
 def require_inertia(robot: Robot) -> None:

@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from tests.support.reader_corpus import INERTIA
 from tests.support.robots import BUNDLED, random_tree
 
 ROOT = 1
@@ -225,3 +226,27 @@ def test_what_is_no_body_is_refused_in_a_line(given, said):
 def test_spreads_that_are_none_are_refused(given, said):
     with pytest.raises(fflin.InputError, match=said):
         fflin.load("ets_vii").perturbed(**given)
+
+
+def test_virtual_joints_of_a_floating_base_are_advised_to_be_locked(tmp_path):
+    axes = ("1 0 0", "0 1 0", "0 0 1")
+    chain = [(kind, axis) for kind in ("prismatic", "revolute") for axis in axes]
+    parts = ['<link name="world_link"/>']
+    parent = "world_link"
+    for index, (kind, axis) in enumerate(chain):
+        body = f'<inertial><mass value="10"/>{INERTIA}</inertial>' if index == 5 else ""
+        parts.append(
+            f'<link name="l{index}">{body}</link>'
+            f'<joint name="v{index}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="l{index}"/><axis xyz="{axis}"/>'
+            '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        )
+        parent = f"l{index}"
+    path = tmp_path / "virtual.urdf"
+    path.write_text(f'<robot name="virtual">{"".join(parts)}</robot>')
+    joints = [f"v{index}" for index in range(6)]
+    with pytest.raises(fflin.SingularInertiaError, match=r"lock=\['v0', 'v1'"):
+        fflin.linearize(fflin.load(path))
+    locked = fflin.load(path, lock=joints)
+    assert locked.n == 0
+    assert fflin.linearize(locked).M[3, 3] == pytest.approx(10.0)
