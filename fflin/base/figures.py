@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from fflin.base.errors import MissingPackageError, optional_package
+from fflin.base.errors import InputError, MissingPackageError, optional_package
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_atomically
 
@@ -56,8 +56,13 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 
 @contextmanager
-def drawing(path: str | Path | None, width: float, height: float) -> Iterator[Figure]:
-    """Yield a figure of `width` x `height` [in] in fflin's style; save it if a path is given."""
+def drawing(
+    path: str | Path | None, width: float, height: float, axes: object = None
+) -> Iterator[Figure]:
+    """Yield a figure of `width` x `height` [in] in fflin's style; save it if a path is given.
+
+    If `axes` are given, the figure is a subfigure that takes the place of these axes in a grid.
+    """
     target = None if path is None else as_path(path)
     if target is not None:
         check_ending(target, FORMATS)
@@ -66,12 +71,34 @@ def drawing(path: str | Path | None, width: float, height: float) -> Iterator[Fi
 
     style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
     with matplotlib.rc_context(style):
-        figure = matplotlib.figure.Figure((width, height), layout="constrained")
+        if axes is None:
+            figure = matplotlib.figure.Figure((width, height), layout="constrained")
+        else:
+            figure = _in_place_of(axes)
         yield figure
         if target is not None:
             content = io.BytesIO()
             figure.savefig(content, format=target.suffix[1:])
             write_atomically({target: content.getvalue()})
+
+
+def _in_place_of(axes: object) -> Figure:
+    """Return a subfigure in place of axes, which are removed.
+
+    Raise `InputError` if `axes` are not axes in a grid, such as those of ``pyplot.subplots``.
+    """
+    from matplotlib.axes import Axes as GivenAxes
+
+    spec = axes.get_subplotspec() if isinstance(axes, GivenAxes) else None
+    if not isinstance(axes, GivenAxes) or spec is None:
+        kind = type(axes).__name__
+        raise InputError(f"axes has type {kind}, expected matplotlib axes, as of pyplot.subplots")
+    owner = axes.figure
+    root = axes.get_figure(root=True)
+    if root.get_layout_engine() is None:
+        root.set_layout_engine("constrained")  # legends beside the panels need it
+    axes.remove()
+    return owner.add_subfigure(spec)
 
 
 def require_matplotlib() -> None:

@@ -32,7 +32,9 @@ _WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
 _DECADES, _BARS, _BINS = 6, 10, 48
 
 
-def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
+def plot_campaign(
+    campaign: Campaign, path: str | Path | None = None, *, worst: int = 3, axes: Axes | None = None
+) -> Figure:
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
     The bands contain 100 %, 90 % and 50 % of the runs. The worst runs, ranked by the figure
@@ -49,6 +51,8 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
         File to save to: .png, .pdf or .svg.
     worst : int
         Number of worst runs to draw, at most five.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Returns
     -------
@@ -80,14 +84,14 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     last = [*((_inputs, *each, runs) for each in groups.items()), (_correlations,)]
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
-    with drawing(path, 11.0, 0.8 + 2.6 * len(rows)) as figure:
+    with drawing(path, 11.0, 0.8 + 2.6 * len(rows), axes=axes) as figure:
         keys: dict[str, Any] = {}
         places = figure.add_gridspec(len(rows), 1)
         for at, row in enumerate(rows):
             cells = places[at].subgridspec(1, len(row))
             for column, (panel, *given) in enumerate(row):
-                panel(axes := figure.add_subplot(cells[column]), campaign, *given)
-                keys |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+                panel(place := figure.add_subplot(cells[column]), campaign, *given)
+                keys |= dict(zip(*place.get_legend_handles_labels()[::-1], strict=True))
         below: Any = "outside lower center"
         figure.legend(keys.values(), keys.keys(), loc=below, ncols=7, handlelength=1.8)
         title = f"{campaign.robot}: {len(campaign):,} runs of {campaign.duration:g} s; "
@@ -96,7 +100,9 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     return figure
 
 
-def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
+def plot_validity(
+    validity: Validity, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Draw the prediction error of a linear model, and how many runs settled at each level.
 
     Parameters
@@ -105,6 +111,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         Result of `fflin.validity`.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Examples
     --------
@@ -115,7 +123,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     """
     instance("validity", validity, Validity, "a Validity, as fflin.validity returns it")
     percent = 100.0
-    with drawing(path, 9.0, 4.3) as figure:
+    with drawing(path, 9.0, 4.3, axes=axes) as figure:
         left, right = figure.subplots(1, 2)
         # The plotted error is divided by the displacement. Therefore the exponent of the plotted
         # error is one less than `slope`, the exponent of the absolute error.
@@ -143,8 +151,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         )
         right.set(title=f"{validity.settled} of {len(settled)} runs settled", ylabel="runs")
         right.yaxis.get_major_locator().set_params(integer=True)
-        for axes in (left, right):
-            axes.set_xlabel("displacement [% of the largest]")
+        for panel in (left, right):
+            panel.set_xlabel("displacement [% of the largest]")
         low, high = validity.rate
         figure.legend(loc="outside lower center", ncols=4)
         figure.suptitle(
@@ -156,7 +164,9 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
+def plot_funnel(
+    funnel: Funnel, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Draw the half-axes of a funnel and the success rates of the runs at each knot.
 
     Parameters
@@ -165,6 +175,8 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
         Result of `fflin.funnel`.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Examples
     --------
@@ -183,18 +195,18 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
         "joints [rad|m]": funnel.joints,
     }
     reach = {name: axes for name, axes in reach.items() if axes.any()}
-    with drawing(path, 9.0, 1.6 + 1.5 * (len(reach) + 1)) as figure:
-        axes = figure.subplots(len(reach) + 1, sharex=True)
-        for ax, (name, half), color in zip(axes, reach.items(), COLORS, strict=False):
+    with drawing(path, 9.0, 1.6 + 1.5 * (len(reach) + 1), axes=axes) as figure:
+        panel = figure.subplots(len(reach) + 1, sharex=True)
+        for ax, (name, half), color in zip(panel, reach.items(), COLORS, strict=False):
             for row in half.T:
                 ax.plot(t, row, "o-", color=color, ms=3, lw=0.7)
             ax.fill_between(t, half.max(axis=1), color=color, alpha=0.15)
             ax.set(ylabel=name, ylim=(0.0, None))
         low, high = percent * funnel.rate.T
-        axes[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="all starts tried")
+        panel[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="all starts tried")
         inside = percent * funnel.inside_rate
-        axes[-1].plot(t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound")
-        axes[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
+        panel[-1].plot(t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound")
+        panel[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
             f"{funnel.robot.name}: initial errors from which every run ends with "

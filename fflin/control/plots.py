@@ -37,7 +37,9 @@ class LoopMargins(NamedTuple):
     gain: tuple[float, float]
 
 
-def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
+def plot_matrices(
+    lin: LinearModel, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Draw the magnitudes of the entries of A and B; entries within rounding error stay blank.
 
     Parameters
@@ -46,6 +48,8 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         Model to draw.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Examples
     --------
@@ -56,11 +60,12 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     nx, nu = lin.B.shape
     cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
     size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
-    with drawing(path, *size) as figure:
-        figure.set_layout_engine("compressed")
+    with drawing(path, *size, axes=axes) as figure:
+        if axes is None:
+            figure.set_layout_engine("compressed")
         from matplotlib.colors import LogNorm
 
-        axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
+        panel = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
         drawn = [np.ma.masked_where(np.abs(m) <= rounding(m), np.abs(m)) for m in (lin.A, lin.B)]
         entries = np.concatenate([m.compressed() for m in drawn])
         top = float(entries.max(initial=0.0)) or 1.0
@@ -70,7 +75,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
             ("B", lin.input_names, input_keys(lin), lin.input_units),
         )
         letters = letters_of(1, 72.0 * cell)
-        for ax, sizes, (title, names, keys, units) in zip(axes, drawn, signals, strict=True):
+        for ax, sizes, (title, names, keys, units) in zip(panel, drawn, signals, strict=True):
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
@@ -81,9 +86,9 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
                 ax.axvline(first - 0.5, color="#888888", lw=0.6)
             for first, *_ in runs(lin.state_names, lin.state_units)[1:]:
                 ax.axhline(first - 0.5, color="#888888", lw=0.6)
-        axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
+        panel[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
         of = "row" if lin.dt else "row's rate"
-        figure.colorbar(image, ax=axes, shrink=0.8).set_label(
+        figure.colorbar(image, ax=panel, shrink=0.8).set_label(
             f"magnitude, in SI units of the {of} per unit of the column"
         )
         time = f", sampled every {lin.dt:g} s" if lin.dt else ""
@@ -91,7 +96,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
+def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
     """Draw the frequency, damping and shape of each mode.
 
     Parameters
@@ -100,6 +105,8 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         Result of `fflin.modes`.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Examples
     --------
@@ -116,26 +123,26 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
         f"{counted(modes.rigid_body, 'rigid-body mode')}"
     )
     if not count:
-        with drawing(path, 6.5, 1.0) as figure:
+        with drawing(path, 6.5, 1.0, axes=axes) as figure:
             figure.suptitle(f"{title}\nno mode to draw; give a joint a stiffness")
         return figure
-    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count) as figure:
+    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count, axes=axes) as figure:
         from matplotlib.patches import Patch
 
-        axes = figure.add_subplot()
+        panel = figure.add_subplot()
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
         labels = []
         for line, mode in enumerate(modes.modes):
-            _draw_shape(axes, line, mode.shape[:half], [colors[unit] for unit in units])
+            _draw_shape(panel, line, mode.shape[:half], [colors[unit] for unit in units])
             growth = "grows" if mode.unstable else "decays"
             label = f"real, {growth} in {mode.time_constant:.3g} s"
             if mode.oscillates:
                 rate, hertz = mode.frequency, mode.frequency / (2.0 * np.pi)
                 label = f"{rate:.3g} rad/s, {hertz:.3g} Hz, damping {mode.damping_ratio:.2g}"
             labels.append(label)
-        axes.set_xticks(range(half), names, rotation=90, fontsize=8)
-        axes.set_yticks(range(count), labels, fontsize=8)
-        axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
+        panel.set_xticks(range(half), names, rotation=90, fontsize=8)
+        panel.set_yticks(range(count), labels, fontsize=8)
+        panel.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
         patches = [Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()]
         said = "largest entry: 1; outline: modulus of an entry out of phase"
         figure.legend(handles=patches, title=said, loc="outside lower center", ncols=len(colors))
@@ -157,7 +164,7 @@ def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> 
     axes.bar(x[late], modulus[late], 0.7, line, fill=False, edgecolor=outline, lw=0.6)
 
 
-def plot_check(check: Check, path: str | Path | None = None) -> Figure:
+def plot_check(check: Check, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
     """Draw each error of a check together with its tolerance.
 
     Parameters
@@ -166,6 +173,8 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         Result of `fflin.check`.
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Examples
     --------
@@ -179,29 +188,34 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     own = ("ABA derivatives", "differences")
     labels = {row: row.block if row.test in own else f"{row.test}: {row.block}" for row in rows}
     names = list(dict.fromkeys(labels.values()))
-    with drawing(path, 7.5, 2.2 + 0.2 * len(names)) as figure:
-        axes = figure.add_subplot()
+    with drawing(path, 7.5, 2.2 + 0.2 * len(names), axes=axes) as figure:
+        panel = figure.add_subplot()
         for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
             shown = [row for row in rows if row.test == test]
             lines = [names.index(labels[row]) + shift for row in shown]
-            axes.plot([row.error for row in shown], lines, "o", color=color, ms=4, label=test)
-            axes.plot([row.tolerance for row in shown], lines, "|", color=color, ms=7)
+            panel.plot([row.error for row in shown], lines, "o", color=color, ms=4, label=test)
+            panel.plot([row.tolerance for row in shown], lines, "|", color=color, ms=7)
         bad = check.failures
-        axes.plot([row.error for row in bad], [names.index(labels[row]) for row in bad], "rx")
-        axes.set_yticks(range(len(names)), names, fontsize=8)
-        axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
-        axes.set_xlabel("relative error (dot) and tolerance (bar)")
+        panel.plot([row.error for row in bad], [names.index(labels[row]) for row in bad], "rx")
+        panel.set_yticks(range(len(names)), names, fontsize=8)
+        panel.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
+        panel.set_xlabel("relative error (dot) and tolerance (bar)")
         verdict = f"OK: {len(check.rows)} errors within tolerance"
         if bad:
             verdict = f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
         exact = len(check.rows) - len(rows)
-        axes.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
+        panel.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 
 
 def plot_poles(
-    poles: object, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
+    poles: object,
+    path: str | Path | None = None,
+    *,
+    dt: float = 0.0,
+    title: str = "poles",
+    axes: Axes | None = None,
 ) -> Figure:
     """Plot a pole map.
 
@@ -218,6 +232,8 @@ def plot_poles(
         drawn.
     title : str
         Title of the figure.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Returns
     -------
@@ -232,16 +248,16 @@ def plot_poles(
     sets = poles if isinstance(poles, dict) and poles else {"": poles}
     found = {str(label): _poles_of(given) for label, given in sets.items()}
     dt = next((own for _, own in found.values() if own), dt)
-    with drawing(path, 6.0, 5.0) as figure:
-        axes = figure.add_subplot()
-        _pole_map(axes, {label: values for label, (values, _) in found.items()}, dt)
-        axes.set_title(title)
+    with drawing(path, 6.0, 5.0, axes=axes) as figure:
+        panel = figure.add_subplot()
+        _pole_map(panel, {label: values for label, (values, _) in found.items()}, dt)
+        panel.set_title(title)
         if any(sets):
             figure.legend(loc="outside lower center", ncols=4)
     return figure
 
 
-def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
+def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
     """Plot the loop gain at each input with the other loops closed: Bode plot, margins and poles.
 
     Parameters
@@ -249,6 +265,8 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     gain : Gain
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Returns
     -------
@@ -261,7 +279,7 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     """
     instance("gain", gain, Gain, "a Gain, as from fflin.lqr")
     tall = max(8.5, 1.5 + 0.12 * len(gain.K))
-    with drawing(path, 11.0, tall) as figure:
+    with drawing(path, 11.0, tall, axes=axes) as figure:
         w, response, loops = input_loops(gain)
         sizes, phases, poles = figure.subplots(3, 1)
         _bode(sizes, phases, w, response)

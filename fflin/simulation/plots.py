@@ -57,7 +57,11 @@ def resting_from(motion: Motion) -> float | None:
 
 
 def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
+    motion: Motion,
+    path: str | Path | None = None,
+    *,
+    show: Sequence[str] | None = None,
+    axes: Axes | None = None,
 ) -> Figure:
     """Draw the errors, inputs and momentum drift of a motion, with the linear prediction.
 
@@ -74,6 +78,8 @@ def plot_motion(
     show : sequence of str, optional
         States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
         ``*.hinge_*``. By default, all states and inputs are drawn.
+    axes : matplotlib.axes.Axes, optional
+        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
     Returns
     -------
@@ -109,39 +115,39 @@ def plot_motion(
     every = [curve for found in drawn.values() for curve in found]
     joints = dict.fromkeys(curve.short for curve in every if curve.group in JOINTS)
     legends: dict[str, dict[str, Artist]] = {}
-    with drawing(path, 11.0, 0.3 + sum(heights)) as figure:
+    with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
         colors = dict(zip(joints, cycle(len(joints)), strict=True))
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
         for (row, column), (title, found) in zip(spots, drawn.items(), strict=False):
-            axes, group = figure.add_subplot(grid[row, column]), found[0].group
-            axes.set_title(f"{title} {group}" if title in states else title)
-            _draw(axes, motion.t, found, colors if group in JOINTS else {})
+            panel, group = figure.add_subplot(grid[row, column]), found[0].group
+            panel.set_title(f"{title} {group}" if title in states else title)
+            _draw(panel, motion.t, found, colors if group in JOINTS else {})
             if motion.tracked and [title] == states[:1]:
-                axes.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
+                panel.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
             if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
                 # Long joint names, or many names, do not fit into a chart. Their legends are below
                 # all charts. One legend names the joints of all charts.
                 named = legends.setdefault("joints" if group in JOINTS else title, {})
-                named.update(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+                named.update(zip(*panel.get_legend_handles_labels()[::-1], strict=True))
             else:
                 if many := len(found) > 3:
-                    axes.margins(y=0.3)  # room for the names above the curves
-                axes.legend(ncols=2 if many else 1, handlelength=1.4)
+                    panel.margins(y=0.3)  # room for the names above the curves
+                panel.legend(ncols=2 if many else 1, handlelength=1.4)
             if errors and title in states:
-                strip = figure.add_subplot(grid[row + 1, column], sharex=axes)
+                strip = figure.add_subplot(grid[row + 1, column], sharex=panel)
                 below = [errors[curve.key] for curve in found]
                 _draw(strip, motion.t, below, colors if group in JOINTS else {}, width=1.0)
                 strip.set_ylabel(f"{what}\n{strip.get_ylabel()}".strip())
                 strip.ticklabel_format(axis="y", scilimits=(-2, 3))
-                axes.tick_params(labelbottom=False)
-                axes.set_xlabel("")
+                panel.tick_params(labelbottom=False)
+                panel.set_xlabel("")
         _name_below(figure, legends)
         starts, rest = motion.starts[1:].tolist(), resting_from(motion)
-        for axes, mark in product(figure.axes, starts if rest is None else [rest]):
-            axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
+        for panel, mark in product(figure.axes, starts if rest is None else [rest]):
+            panel.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
         _draw_drifts(figure.add_subplot(grid[spots[-1]]), motion)
-        for axes in figure.axes:
-            axes.margins(x=0.0)
+        for panel in figure.axes:
+            panel.margins(x=0.0)
         head = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
         head += ["solid: nonlinear, dashed: linear"] * (motion.linear is not None)
         phases = zip(motion.phases[1:], starts, strict=True)

@@ -109,3 +109,21 @@ def test_what_has_no_poles_is_one_line():
             fflin.plot_poles(given)
     with pytest.raises(fflin.InputError, match="masked"):
         fflin.plot_poles(masked)
+
+
+def test_figures_are_drawn_in_place_of_the_users_axes(tmp_path):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    gain = fflin.lqr(lin)
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(14, 9))
+    part = fflin.plot_poles(gain, axes=left)
+    fflin.plot_matrices(lin, axes=right)
+    assert part in figure.subfigs
+    assert left not in figure.axes
+    # A pole map has one panel. The matrices have two, and a colour bar.
+    assert len(part.axes) == 1
+    assert len(figure.subfigs) == 2
+    figure.savefig(tmp_path / "both.png")
+    pyplot.close(figure)
+    with pytest.raises(fflin.InputError, match="matplotlib axes"):
+        fflin.plot_poles(gain, axes="left")
