@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from fflin.base.errors import InputError, MissingPackageError, optional_package
 from fflin.base.validation import Array
@@ -93,12 +93,13 @@ def _in_place_of(axes: object) -> Figure:
     if not isinstance(axes, GivenAxes) or spec is None:
         kind = type(axes).__name__
         raise InputError(f"axes has type {kind}, expected matplotlib axes, as of pyplot.subplots")
-    owner = axes.figure
-    root = axes.get_figure(root=True)
+    owner: Any = axes.figure
+    root: Any = axes.get_figure(root=True)
     if root.get_layout_engine() is None:
         root.set_layout_engine("constrained")  # legends beside the panels need it
     axes.remove()
-    return owner.add_subfigure(spec)
+    figure: Figure = owner.add_subfigure(spec)
+    return figure
 
 
 def require_matplotlib() -> None:
