@@ -98,7 +98,8 @@ def test_forces_of_all_kinds(fields):
     lin = fflin.linearize(robot)
     K = 0.05 * np.random.default_rng(1).normal(size=lin.B.shape[::-1])
     policy = fflin.StateFeedback(lin, K)
-    both(robot, policy, x0=displaced(lin), duration=4.0)
+    # Under gravity, this loop diverges after some seconds, and rounding errors grow with it.
+    both(robot, policy, x0=displaced(lin), duration=2.0)
 
 
 def test_mimic_joints(tmp_path):
