@@ -12,16 +12,18 @@ ROBOT = "planar_detumble"
 
 
 def test_a_plan_is_followed(tmp_path):
-    command = ("plan", ROBOT, "--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    locked = ("--lock", "joint_2", "--lock", "joint_3")
+    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    command = ("plan", ROBOT, *locked, *target)
     code, out, _ = run(*command, "--limit", "tau_m=0.5", "-o", "p.npz", cwd=tmp_path)
     assert code == 0 and "wrote p.npz" in out
-    robot = fflin.load(ROBOT)
+    robot = fflin.load(ROBOT, lock=["joint_2", "joint_3"])
     motion = fflin.Trajectory.load(tmp_path / "p.npz", robot)
     end = fflin.configuration(robot, {"joint_1": 0.3})
     assert np.abs(motion.q[0] - robot.neutral()).max() < 1e-9
     assert np.abs(motion.q[-1] - end).max() < 1e-6
     assert motion.residual.max() < 1e-5 and np.abs(motion.u[:, 6:]).max() <= 0.5 + 1e-9
-    flown = run("simulate", ROBOT, "--trajectory", "p.npz", "-o", "m.npz", cwd=tmp_path)
+    flown = run("simulate", ROBOT, *locked, "--trajectory", "p.npz", "-o", "m.npz", cwd=tmp_path)
     assert flown[0] == 0
     # One percent of the displacement.
     assert np.abs(fflin.Motion.load(tmp_path / "m.npz").q[-1] - end).max() < 0.003

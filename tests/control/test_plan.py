@@ -534,7 +534,7 @@ def test_long_steps_are_corrected(monkeypatch):
     """From the same iterations, a search without second-order corrections needs more effort."""
     robot = fflin.load("planar_detumble", lock=["joint_3"])
     goal = fflin.configuration(robot, {"joint_1": 0.3})
-    monkeypatch.setattr(plan_search, "_MOST", 6)
+    monkeypatch.setattr(plan_search, "_MOST", 10)
     options = {"knots": 11, "limits": ARM}
     with any_wording():
         corrected = fflin.plan(robot, (goal, None), 20.0, **options)

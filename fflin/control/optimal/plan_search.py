@@ -1,5 +1,6 @@
 """Search for a plan by sequential quadratic programming with multiple shooting."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Mask
+from fflin.base.validation import Array, Indices, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.linear.optimality import Optimality
 
@@ -34,10 +35,10 @@ _NEARLY = 1e-3
 _SEEKS, _FLIES = 1e-6, 1e-8
 
 # The search ends after _MOST iterations, or if _MOST_TRIES steps fail to reduce the merit function.
-# It ends earlier if an iteration adds no limit within the intervals, the predicted reduction of the
-# merit function is at most _SAVED times its value, and the stationarity is at most _STATIONARY. The
+# It ends earlier if an iteration adds no limit within the intervals, and the predicted reduction of
+# the merit function is at most _SAVED times its value, with a small Levenberg-Marquardt cost. The
 # gaps are closed in at most _MOST_CLOSING iterations.
-_SAVED, _STATIONARY, _MOST, _MOST_TRIES, _MOST_CLOSING = 1e-6, 1e-3, 100, 8, 20
+_SAVED, _MOST, _MOST_TRIES, _MOST_CLOSING = 1e-6, 100, 8, 20
 
 # A step is corrected up to _MOST_CORRECTIONS times, until the merit function falls by _ENOUGH times
 # the predicted reduction. It is accepted if the merit function falls by _SOME times the predicted
@@ -45,9 +46,9 @@ _SAVED, _STATIONARY, _MOST, _MOST_TRIES, _MOST_CLOSING = 1e-6, 1e-3, 100, 8, 20
 _MOST_CORRECTIONS, _ENOUGH, _SOME = 4, 0.5, 0.1
 
 # The Levenberg-Marquardt cost is multiplied by _LESS after a step that reduces the merit function
-# by _ENOUGH, and by _MORE after a step that fails. It is at least _LEAST times its first value,
-# because the solver may fail without it.
-_LESS, _MORE, _LEAST = 0.2, 4.0, 1e-6
+# by _MUCH times the predicted reduction, and by _MORE after a step that fails. It is at least
+# _LEAST times its first value, because the solver may fail without it.
+_LESS, _MUCH, _MORE, _LEAST = 0.2, 0.75, 4.0, 1e-4
 
 # Levenberg-Marquardt cost of a step of the wheel angles and rates, relative to this cost for the
 # other states. It is small, because wheels may turn far and fast.
@@ -92,13 +93,14 @@ class Models(NamedTuple):
 
     ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
     rows: sp.csr_array  # one row for each limit
-    at_knots: tuple[Array, ...]  # knot and state of the first rows
-    within: tuple[Array, ...]  # interval, part and state of the other rows
+    at_knots: tuple[Indices, ...]  # knot and state of the first rows
+    within: tuple[Indices, ...]  # interval, part and state of the other rows
 
     def room(self, trial: Trial) -> Array:
         """Return the lower and upper limits (2, m) of the rows about a trial."""
-        at_knots = trial.knots[(slice(None), *self.at_knots)]
-        room: Array = np.hstack((at_knots, trial.inside[(slice(None), *self.within)]))
+        knot, state = self.at_knots
+        k, part, limited = self.within
+        room: Array = np.hstack((trial.knots[:, knot, state], trial.inside[:, k, part, limited]))
         return room
 
 
@@ -155,27 +157,32 @@ class Search(NamedTuple):
             moved = None
             for attempt in range(_MOST_TRIES):
                 step = self._step(trial, models, near, cost * trial.u)
-                if attempt == 0 and (step is None or self._is_hopeless(trial, step, left)):
+                if step is None:  # the solver failed
+                    near = _MORE * near
+                    continue
+                if attempt == 0 and self._is_hopeless(trial, step, left):
                     return self._flown(trial.u), None
-                if step is None:
-                    break
                 # Powell's rule sets the penalty on gaps from the multipliers.
                 y = np.abs(step.gaps)
                 price = np.maximum(y, 0.5 * (price + y))
                 saved = self._merit(trial, price, limited) - self._promised(trial, step)
-                moved, gain = self._corrected(trial, models, near, step, price, limited, saved)
-                if moved is not None:
+                moved, gain, exceeding = self._corrected(
+                    trial, models, near, step, price, limited, saved
+                )
+                if moved is None and (exceeding & ~limited).any():
+                    moved = trial  # repeat the step with more limits within the intervals
+                small = saved <= _SAVED * self._merit(trial, price, limited)
+                if moved is not None or small:
                     break
                 near = _MORE * near
             if moved is None:
                 break
-            if gain >= _ENOUGH * saved:
+            converged = small and bool((near <= first).all())
+            if gain >= _MUCH * saved:
                 near = np.maximum(_LESS * near, _LEAST * first)
-            before = self._merit(trial, price, limited)
-            stationary = self._stationarity(trial.u, step.gradient) <= _STATIONARY
             trial = moved
-            known, limited = limited, limited | self._exceeding(trial)
-            if saved <= _SAVED * before and stationary and (limited == known).all():
+            known, limited = limited, limited | exceeding
+            if converged and (limited == known).all():
                 break
         trial = self._closed(trial, limited, first, left)
         return trial, self._optimality(trial, limited, first, iteration + 1)
@@ -207,7 +214,8 @@ class Search(NamedTuple):
         """
         least = np.clip(u - gradient / self.cost, *self.limits)
         distance = float((self.cost * (u - least) ** 2).sum())
-        return (distance / (float((self.cost * u**2).sum()) or 1.0)) ** 0.5
+        size = float((self.cost * u**2).sum())
+        return math.sqrt(distance / (size or 1.0))
 
     def _merit(self, trial: Trial, price: Array, limited: Mask) -> float:
         """Return the effort plus the costs of the gaps and the violations of a trial."""
@@ -228,10 +236,11 @@ class Search(NamedTuple):
         price: Array,
         limited: Mask,
         saved: float,
-    ) -> tuple[Trial | None, float]:
+    ) -> tuple[Trial | None, float, Mask]:
         """Return the trial after a step and its corrections, and how much the merit function falls.
 
-        Return None if the merit function does not fall enough, compared with the predicted
+        The third result is `limited` and the points within intervals at which a trial exceeds a
+        limit. Return None if the merit function does not fall enough, compared with the predicted
         reduction `saved`.
         """
         # A correction solves the quadratic program again, with the gaps and violations at the end
@@ -241,23 +250,26 @@ class Search(NamedTuple):
             trial.missed,
             self.cost * trial.u,
         )
-        best, most = None, -np.inf
+        best, most, gap, exceeding = None, -np.inf, np.inf, limited
         corrections = _MOST_CORRECTIONS if step.outside <= _HOPELESS else 0
         for correction in range(1 + corrections):
             u = np.clip(trial.u + step.du, *self.limits)
             end = self._trial(*self.shooting.moved(trial.q, trial.v, step.z), u)
-            gain = before - self._merit(end, price, limited)
+            exceeding = exceeding | self._exceeding(end)
+            gain = before - self._merit(end, price, exceeding)
             if gain >= _SOME * saved and gain > most:
                 best, most = end, gain
             if gain >= _ENOUGH * saved or not np.isfinite(gain) or correction == corrections:
                 break
-            missed = missed + end.missed
+            if end.gap > gap:  # the corrections do not converge
+                break
+            gap, missed = end.gap, missed + end.missed
             room = models.room(end) + step.moved
             again = self._step(trial, models, near, effort, missed, room)
             if again is None:
                 break
             step = again
-        return best, most
+        return best, most, exceeding
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
