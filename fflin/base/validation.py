@@ -129,6 +129,22 @@ def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expe
     return value
 
 
+def function(name: str, value: Callable[..., object], arguments: str) -> None:
+    """Raise `InputError` if a callable cannot take `arguments`, such as "(t, q, v)"."""
+    from inspect import signature
+
+    try:
+        expected = signature(value)
+    except (TypeError, ValueError):  # some compiled functions have no signature
+        return
+    try:
+        expected.bind(*arguments.split(","))
+    except TypeError:
+        raise InputError(
+            f"{name} is a function of {expected}, expected a function of {arguments}"
+        ) from None
+
+
 def truth(name: str, value: object) -> bool:
     """Return True or False, or raise `InputError` if the value is neither a bool nor an integer."""
     return bool(instance(name, value, (bool, np.bool_, int), "True or False"))

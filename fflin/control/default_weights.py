@@ -14,6 +14,7 @@ from fflin.base.validation import Array, Complex
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
+from fflin.robot.rotors import motor_of
 
 # Nominal bandwidth [rad/s], with which a loop settles in about 30 s. Limits may reduce it. If the
 # inputs are held for h seconds, the frequency of the fastest mode is at most _HELD / h [rad/s].
@@ -90,8 +91,8 @@ class Limit(NamedTuple):
 def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
     """Return the weights (10.7), with which a displaced robot returns without exceeding its limits.
 
-    `momenta` maps the name of each wheel speed to the largest momentum [N m s] that the inputs may
-    add to the wheel.
+    `momenta` maps the speed of each wheel that has a motor to the largest momentum [N m s] that the
+    motor may add to the wheel.
     """
     m = len(lin.M)
     N = rate_matrix(lin)[:m, m:]
@@ -166,8 +167,8 @@ def _of_inertia(
     # add to wheels.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {**momenta}
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
-    motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
-    taken = np.vstack((T, added[motors]))
+    motors = [motor_of(lin.input_names, name.removeprefix("qdot_m.")) for name in momenta]
+    taken = np.vstack((T, added[np.array(motors, dtype=np.intp)]))
     use = _largest_use(gain, size, lin.state_names)
     speeds = _limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0)
     efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)

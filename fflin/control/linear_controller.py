@@ -16,7 +16,7 @@ import numpy as np
 from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.names import undotted
 from fflin.base.record import read_record, reading, texts
-from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
+from fflin.base.validation import Array, Indices, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
@@ -222,20 +222,56 @@ class LinearController(Feedback):
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
 
 
-def growing(policy: object) -> tuple[str, ...]:
-    """Return a warning if a linear controller is unstable, and another if its loop is unstable."""
-    said, by = list[str](), decider(policy)
+def growing(policy: object, held: float = 0.0) -> tuple[str, ...]:
+    """Return notes on the poles of a linear loop that are unstable, and of its controller.
+
+    `held` is the time [s] for which the commands of the policy are held; 0 if it is continuous.
+    """
+    by = decider(policy)
     if not isinstance(by, LinearController):
-        return ()
+        return _growing_feedback(policy, held)
     hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
-    systems = ("linear loop", by.loop, hint), ("controller by itself", by.system.A, "")
-    for what, matrix, advice in systems:
-        poles = np.linalg.eigvals(matrix)
-        growth = np.abs(poles) - 1.0 if by.dt else poles.real
-        if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
-            pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
-            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}")
-    return tuple(said)
+    of_loop = _unstable("linear loop", by.loop, by.dt, hint)
+    return of_loop + _unstable("controller by itself", by.system.A, by.dt, "")
+
+
+def _unstable(what: str, matrix: Array, dt: float, advice: str) -> tuple[str, ...]:
+    """Return a note if a pole of `matrix` (n, n) is unstable; dt [s] is 0 in continuous time."""
+    poles = np.linalg.eigvals(matrix)
+    growth = np.abs(poles) - 1.0 if dt else poles.real
+    if not (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
+        return ()
+    pole, unit = complex(poles[growth.argmax()]), "" if dt else " 1/s"
+    return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
+
+
+def _growing_feedback(policy: object, held: float) -> tuple[str, ...]:
+    """Return a note if the linear loop of a state feedback is unstable."""
+    lin, K = feedback_of(policy)
+    if lin is None or K is None:
+        return ()
+    loop = lin.A - lin.B @ K
+    own = _unstable("linear loop", loop[_on_feedback(loop, K)], lin.dt, "")
+    if own or lin.dt or not held:
+        return own
+    sampled = lin.discretize(held)
+    advice = (
+        f"; the gain was designed in continuous time, but its commands are held for {held:g} s: "
+        f"shorten the sample time, or design the gain for it (lin.discretize({held:g}))"
+    )
+    loop = sampled.A - sampled.B @ K
+    return _unstable("sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice)
+
+
+def _on_feedback(A: Array, K: Array) -> tuple[Indices, Indices]:
+    """Return rows and columns of the states that affect the states that the gain K feeds back.
+
+    Other states, such as the position of a base that no input pushes, may drift in a stable loop.
+    """
+    acting = K.any(axis=0)
+    for _ in A:
+        acting = acting | A[acting].any(axis=0)
+    return np.ix_(acting, acting)
 
 
 def closed_loop(policy: object) -> tuple[Array, float] | None:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, ArrayLike, frozen, instance, shaped, vector
+from fflin.base.validation import Array, ArrayLike, frozen, function, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame, readout
@@ -373,6 +373,7 @@ def bound(policy: object, robot: Robot) -> Policy:
             f"policy has type {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
             "StateFeedback(lin, gain.K)"
         )
+    function("policy", result, "(t, q, v)")
     return result
 
 

@@ -11,13 +11,23 @@ from fflin.analysis.ranks import null_space
 from fflin.analysis.reduction import ignorable_wheels, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
-from fflin.base.validation import Array, dimension, instance, number, numbers, positive, shaped
+from fflin.base.validation import (
+    Array,
+    Indices,
+    dimension,
+    instance,
+    number,
+    numbers,
+    positive,
+    shaped,
+)
 from fflin.control.default_weights import Pace, default_weights
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import require_chart
+from fflin.robot.rotors import motor_of
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
 
@@ -297,6 +307,16 @@ def rule_weights(
     return (*sampled_cost(source, lin.dt, Q, R), rule)
 
 
+def _limited_wheels(lin: LinearModel, wheels: Indices) -> Indices:
+    """Return the indices (k,) of the wheels with a motor and a speed limit."""
+    limited = list[int]()
+    for i in wheels:
+        motor = motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m."))
+        if motor is not None and lin.state_names[i + len(lin.M)] in lin.limits:
+            limited.append(i)
+    return np.array(limited, dtype=np.intp)
+
+
 def _of_regulated(
     lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str, Array]:
@@ -308,7 +328,7 @@ def _of_regulated(
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
     body = lin if part is lin else regulated_part(without(lin, wheels))
-    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    at = _limited_wheels(lin, wheels)
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
     # For a wheel that is already at its speed limit, `room` is computed as for a wheel at rest. The

@@ -20,6 +20,7 @@ from fflin.base.validation import (
     Array,
     ArrayLike,
     as_double,
+    function,
     instance,
     number,
     truth,
@@ -298,6 +299,8 @@ def _functions(options: SimulationOptions) -> tuple[Event, ...]:
         if not callable(given) and (given is not None or name == "event"):
             kind = type(given).__name__
             raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+        if callable(given):
+            function(name, given, arguments)
     return events
 
 

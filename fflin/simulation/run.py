@@ -166,6 +166,11 @@ class Plant(Aba):
         total, single = np.zeros(len(names)), dict[str, float]()
         for key, value in forces.items():
             what = f"disturbance '{key}'"
+            if callable(value):
+                raise InputError(
+                    f"{what} is a function, expected a number; for a disturbance that changes in "
+                    f"time, give a function of (t, q, v) that returns {{'{key}': number}}"
+                )
             if key in ("tau_b", "F_b") and dimension(what, value):
                 rows = ANGULAR if key == "tau_b" else LINEAR
                 total[rows] = vector(what, value, 3, "the components x, y and z")

@@ -306,7 +306,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         mode_rotations=np.array([*map(attrgetter("rotation"), robot.modes)]),
         steered=plan.steered,
         notes=(
-            *growing(plan.policy),
+            *growing(plan.policy, plan.times.sample * plan.times.dt),
             *plan.times.notes,
             *_energy_note(plan, run, energy, float(scale[0])),
             *dict.fromkeys(note for each in policies for note in getattr(each, "notes", ())),

@@ -64,6 +64,28 @@ def test_designs_are_those_of_reaction_wheels(others, spinning, dt):
         assert gain.weights == expected.weights
 
 
+def test_speed_limits_of_wheels_bound_the_default_weights():
+    """Speed limits of wheels that are joints count as those of `ReactionWheel` do."""
+    limits = {"qdot_m.wheel_*": 10.0}
+    (_, lin), (_, other) = models(spinning=False, limits=limits)
+    x, u = matched(lin, other)
+    gain, expected = fflin.lqr(lin), fflin.lqr(other)
+    assert gain.weights == expected.weights
+    assert "bandwidth limited by the speed of wheel_" in gain.weights
+    assert np.abs(gain.K[np.ix_(u, x)] - expected.K).max() < 10.0 * CLOSE * np.abs(expected.K).max()
+
+
+def test_the_speed_limit_of_a_wheel_without_motor_does_not_bound_the_loop():
+    """No input accelerates this wheel relative to inertial space, so its limit has no effect."""
+    satellite, _ = spun(AXES[:2], others=(BaseTorque(), BaseForce()))
+    satellite = satellite.replace(
+        wheel_joints=["wheel_*"], inputs=[*satellite.inputs[:3], fflin.JointTorque("wheel_1")]
+    )
+    limited = satellite.replace(limits={"qdot_m.wheel_2": 1e-3})
+    gains = [fflin.lqr(fflin.linearize(each)) for each in (satellite, limited)]
+    assert (gains[0].K == gains[1].K).all()
+
+
 @pytest.mark.parametrize("spinning", [True, False])
 def test_filters_and_reductions_are_those_of_reaction_wheels(spinning):
     (robot, lin), (twin, other) = models((BaseTorque(),), spinning=spinning)

@@ -54,3 +54,21 @@ def test_an_unknown_force_is_refused(robot):
         flown(robot, {"tau_c": 1.0})
     with pytest.raises(fflin.InputError, match="tau_b"):
         flown(robot, {"tau_b": (1.0, 2.0)})
+
+
+def test_a_function_in_a_mapping_is_refused_with_the_form_that_varies_in_time(robot):
+    with pytest.raises(
+        fflin.InputError, match=r"is a function, expected a number; .*'tau_b.x': nu"
+    ):
+        flown(robot, {"tau_b.x": np.sin})
+    motion = flown(robot, lambda t, q, v: {"tau_b.x": np.sin(t)})
+    assert np.ptp(motion.energy) > 0.0
+
+
+@pytest.mark.parametrize("option, arguments", [("disturbance", 3), ("callback", 4), ("policy", 3)])
+def test_a_function_of_other_arguments_is_refused(robot, option, arguments):
+    names = "(t, q, v, u)" if arguments == 4 else "(t, q, v)"
+    options = {"duration": 0.1, "dt": 0.05, option: lambda t: None}
+    with pytest.raises(fflin.InputError) as error:
+        fflin.simulate(robot, **options)
+    assert str(error.value) == f"{option} is a function of (t), expected a function of {names}"

@@ -466,3 +466,33 @@ def test_a_wheel_may_turn_many_times_a_step():
     assert np.ptp(motion.energy) < 1e-9 * motion.energy[0]
     fine = fflin.simulate(robot, v0=v0, duration=20.0, dt=0.005, every=200)
     np.testing.assert_allclose(motion.v[:, 3:6], fine.v[:, 3:6], atol=1e-9)
+
+
+@pytest.mark.parametrize("part, unstable", [(0.98, False), (1.02, True)])
+def test_a_gain_that_is_sampled_too_slowly_is_reported(part, unstable):
+    """Each axis is a double integrator with u = -J (w^2 angle + sqrt(2) w rate).
+
+    By the criterion of Jury, its loop with commands held for h is stable if w h < sqrt(2).
+    """
+    w = 0.5
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(robot)
+    J, K = np.diag((20.0, 30.0, 40.0)), np.zeros((3, 12))
+    K[:, :3] = 2.0 * w**2 * J  # q_b is half of the angle
+    K[:, 6:9] = np.sqrt(2.0) * w * J
+    sample = part * np.sqrt(2.0) / w
+    policy, options = fflin.StateFeedback(lin, K), {"duration": 4 * sample, "dt": sample / 20}
+    assert not fflin.simulate(robot, policy, **options).notes
+    notes = fflin.simulate(robot, policy, sample=sample, **options).notes
+    assert any("sampled linear loop is unstable" in note for note in notes) == unstable
+    # A gain that was designed for this sample time has the same loop, without the advice.
+    notes = fflin.simulate(robot, fflin.StateFeedback(lin.discretize(sample), K), **options).notes
+    assert [note for note in notes if "unstable" in note and "held" not in note] == list(notes)
+    assert bool(notes) == unstable
+
+
+def test_a_state_feedback_of_the_wrong_sign_is_reported():
+    robot = free_body((20.0, 30.0, 40.0))
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, -fflin.lqr(lin).K)
+    assert "the linear loop is unstable" in fflin.simulate(robot, policy, duration=1.0).notes[0]
