@@ -61,8 +61,10 @@ _OF_WHEELS = 1e-6
 _STAGNANT, _HOPELESS = 10, 1e-2
 
 # Cost of a violation of the goal or a limit, per unit of the sum of violations [rad, m, s]. For
-# comparison, the effort of the initial guess costs 1/2.
-_PRICE = 1e3
+# comparison, the effort of the initial guess costs 1/2. If a search ends with violations, because
+# they cost less than the effort that avoids them, it is repeated from there with a cost that is
+# _RAISE times larger, up to _LARGEST_PRICE.
+_PRICE, _RAISE, _LARGEST_PRICE = 1e3, 30.0, 1e8
 
 
 class Trial(NamedTuple):
@@ -135,12 +137,16 @@ class Search(NamedTuple):
     cost: Array  # weights of squared inputs (N + 1, nu)
     parts: int  # number of equal parts per interval; limits can apply at the end of each part
     report: Callable[[str], None]  # receives a line of text in each iteration
+    price: float = _PRICE
 
-    def best(self, q: Array, v: Array, u: Array) -> tuple[Trial, Optimality | None]:
+    def best(
+        self, q: Array, v: Array, u: Array, iterations: int = 0
+    ) -> tuple[Trial, Optimality | None]:
         """Return the trial of least effort, and how nearly it is stationary.
 
         The search begins at the knots q, v and the inputs u. If the search fails, return the motion
-        under the last inputs, and None. The effort is the sum of ``cost * u**2``.
+        under the last inputs, and None. The effort is the sum of ``cost * u**2``. `iterations` is the
+        number of earlier iterations.
         """
         shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
@@ -176,16 +182,24 @@ class Search(NamedTuple):
                     break
                 near = _MORE * near
             if moved is None:
-                break
-            converged = small and bool((near <= first).all())
-            if gain >= _MUCH * saved:
+                if not small or bool((near <= 1.1 * _LEAST * first).all()):
+                    break
+                near = np.maximum(_LESS * near, _LEAST * first)
+                continue
+            # With a large Levenberg-Marquardt cost, a small reduction is no sign of a minimum.
+            converged = small and bool((near <= 1.1 * _LEAST * first).all())
+            if small or gain >= _MUCH * saved:
                 near = np.maximum(_LESS * near, _LEAST * first)
             trial = moved
             known, limited = limited, limited | exceeding
             if converged and (limited == known).all():
                 break
+        iterations += iteration + 1
+        if _ENDS < trial.outside(limited) <= _HOPELESS and self.price < _LARGEST_PRICE:
+            dearer = self._replace(price=_RAISE * self.price)
+            return dearer.best(trial.q, trial.v, trial.u, iterations)
         trial = self._closed(trial, limited, first, left)
-        return trial, self._optimality(trial, limited, first, iteration + 1)
+        return trial, self._optimality(trial, limited, first, iterations)
 
     def _optimality(
         self, trial: Trial, limited: Mask, near: Array, iterations: int
@@ -194,7 +208,7 @@ class Search(NamedTuple):
         models = self._models(trial, limited | self._exceeding(trial))
         if models is None:
             return None
-        step = self._step(trial, models, 0.0 * near, self.cost * trial.u)
+        step = self._step(trial, models, _LEAST * near, self.cost * trial.u)
         if step is None:
             return None
         effort = float((self.cost * trial.u**2).sum())
@@ -221,11 +235,11 @@ class Search(NamedTuple):
         """Return the effort plus the costs of the gaps and the violations of a trial."""
         effort = float((self.cost * trial.u**2).sum()) / 2.0
         gaps = float((price * np.abs(trial.missed)).sum())
-        return effort + gaps + _PRICE * trial.outside(limited)
+        return effort + gaps + self.price * trial.outside(limited)
 
     def _promised(self, trial: Trial, step: Step) -> float:
         """Return the merit function after a step, according to the linear models."""
-        return float((self.cost * (trial.u + step.du) ** 2).sum()) / 2.0 + _PRICE * step.outside
+        return float((self.cost * (trial.u + step.du) ** 2).sum()) / 2.0 + self.price * step.outside
 
     def _corrected(
         self,
@@ -334,7 +348,7 @@ class Search(NamedTuple):
         u, nx, ends, rows = trial.u, len(near), models.ends, models.rows
         missed = trial.missed if missed is None else missed
         room = models.room(trial) if room is None else room
-        prices, of_x = np.full(room.shape[1], _PRICE), np.zeros((len(u), nx))
+        prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nx))
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
