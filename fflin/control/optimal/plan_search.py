@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from fflin.base.errors import InputError, optional_package
-from fflin.base.validation import Array, Mask
+from fflin.base.validation import Array, Indices, Mask
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.linear.optimality import Optimality
 
@@ -92,13 +92,14 @@ class Models(NamedTuple):
 
     ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
     rows: sp.csr_array  # one row for each limit
-    at_knots: tuple[Array, ...]  # knot and state of the first rows
-    within: tuple[Array, ...]  # interval, part and state of the other rows
+    at_knots: tuple[Indices, Indices]  # knot and state of the first rows
+    within: tuple[Indices, Indices, Indices]  # interval, part and state of the other rows
 
     def room(self, trial: Trial) -> Array:
         """Return the lower and upper limits (2, m) of the rows about a trial."""
-        at_knots = trial.knots[(slice(None), *self.at_knots)]
-        room: Array = np.hstack((at_knots, trial.inside[(slice(None), *self.within)]))
+        knot, limit = self.at_knots
+        k, part, state = self.within
+        room: Array = np.hstack((trial.knots[:, knot, limit], trial.inside[:, k, part, state]))
         return room
 
 
@@ -212,7 +213,8 @@ class Search(NamedTuple):
         """
         least = np.clip(u - gradient / self.cost, *self.limits)
         distance = float((self.cost * (u - least) ** 2).sum())
-        return (distance / (float((self.cost * u**2).sum()) or 1.0)) ** 0.5
+        effort = float((self.cost * u**2).sum()) or 1.0
+        return float(np.sqrt(distance / effort))
 
     def _merit(self, trial: Trial, price: Array, limited: Mask) -> float:
         """Return the effort plus the costs of the gaps and the violations of a trial."""
