@@ -12,7 +12,7 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, ArrayLike, Mask, number, whole
+from fflin.base.validation import Array, ArrayLike, Mask, instance, number, whole
 from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
@@ -50,6 +50,7 @@ def plan(
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
+    guess: Trajectory | None = None,
     progress: bool | None = None,
 ) -> Trajectory:
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
@@ -100,6 +101,11 @@ def plan(
     free : sequence of str
         States whose end value is free, by name, group or pattern:
         ``["r_b", "qdot_m.wheel_*"]``.
+    guess : Trajectory, optional
+        Motion at which the search begins, with its time scaled to the duration. By default, the
+        search begins at a cubic curve from the start to the goal. If joint torques alone act, the
+        system is nonholonomic: only loops of the joints rotate the base. Then give a guess in which
+        the joints move in loops.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
         violation on stderr. By default, they are shown for long runs if stderr is a terminal.
@@ -177,7 +183,8 @@ def plan(
         cost = held[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
-        made = _least(search)
+        first = shooting.guess(start, end) if guess is None else _guessed(shooting, guess, start)
+        made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
@@ -209,14 +216,31 @@ class _Made(NamedTuple):
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
 
 
-def _least(search: Search) -> _Made:
+def _guessed(shooting: Shooting, guess: object, start: Point) -> tuple[Array, Array, Array]:
+    """Return knots q, v and inputs u of a given motion, at the times of the plan."""
+    motion = instance("guess", guess, Trajectory, "a fflin.Trajectory")
+    robot = shooting.state.robot
+    if (motion.robot.nq, motion.robot.nv) != (robot.nq, robot.nv) or (
+        input_keys(motion.actuation) != input_keys(Actuation(shooting.state))
+    ):
+        raise InputError("guess is a motion of a robot with other joints or inputs")
+    fraction = shooting.t / shooting.t[-1]
+    pace = (motion.t[-1] - motion.t[0]) / shooting.t[-1]
+    q, v, u = motion.points(motion.t[0] + fraction * (motion.t[-1] - motion.t[0]))
+    q, v = q.copy(), pace * v
+    q[0], v[0] = start
+    return q, v, u.copy()
+
+
+def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
+
+    The search begins at the knots q, v and the inputs u of the guess.
 
     An attempt that reaches the goal is better than an attempt that does not. If both or neither
     reach the goal, the attempt with the smaller violation is better.
     """
     shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
-    guess = shooting.guess(search.start, search.end)
     unit = float((cost * guess[2] ** 2).sum() or cost.sum())
     cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
@@ -276,6 +300,14 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
             "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
             "chosen; leave them free with `free` (--free-end), and also r_b or q_b if the goal "
             "moves the base"
+        )
+    elif asked[state.groups.q_b].any() and all(
+        isinstance(each, JointTorque) for each in robot.inputs
+    ):
+        advice = (
+            "joint torques alone rotate the base only if the joints move in loops (the system is "
+            "nonholonomic); give a `guess` in which the joints move in loops, or leave q_b free "
+            "with `free` (--free-end)"
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "

@@ -527,6 +527,48 @@ def test_a_plan_of_the_closed_form_is_stationary(cube):
         assert (np.abs(motion.u[:, 2]).max() > 1e-3 * (1.0 - 1e-9)) == (duration < 10.0)
 
 
+@pytest.fixture(scope="module")
+def loop():
+    """Two hinged bodies whose joints moved in a loop, and this motion."""
+    inputs = [fflin.JointTorque("joint_1"), fflin.JointTorque("joint_2")]
+    robot = fflin.load("planar_detumble", lock=["joint_3"], inputs=inputs, damping={})
+
+    def torques(t, q, v):
+        phase = 2.0 * np.pi * t / 10.0
+        return np.array([2.0 * np.sin(phase), 0.6 * np.cos(phase)])
+
+    run = fflin.simulate(robot, torques, duration=10.0, dt=0.02, sample=0.5)
+    return robot, run.trajectory()
+
+
+FREE_OF_JOINTS = ["r_b", "v_b", "omega_b"]
+
+
+def test_a_guess_of_joints_that_move_in_loops_rotates_the_base(loop):
+    robot, known = loop
+    goal = (known.q[-1], known.v[-1])
+    options = {"knots": 21, "free": FREE_OF_JOINTS, "limits": None}
+    assert np.abs(pin.log3(pin.Quaternion(goal[0][3:7]).matrix())).max() > 0.02
+    with any_wording():
+        motion = fflin.plan(robot, goal, 10.0, guess=known, **options)
+    assert np.abs(pin.difference(robot.model, goal[0], motion.q[-1])[3:]).max() < 1e-6
+    assert np.abs(motion.v[-1] - goal[1])[6:].max() < 1e-6 and motion.residual.max() < 1e-6
+    assert motion.optimality.effort < 0.9 * 0.5 * np.square(known.u[:-1]).sum()
+    other = fflin.load("planar_detumble")
+    with any_wording(), pytest.raises(fflin.InputError, match="other joints or inputs"):
+        fflin.plan(other, (None, None), 10.0, guess=known, knots=21)
+    with any_wording(), pytest.raises(fflin.InputError, match="guess"):
+        fflin.plan(robot, goal, 10.0, guess=known.q, knots=21)
+
+
+def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(loop, monkeypatch):
+    robot, _ = loop
+    monkeypatch.setattr(plan_search, "_MOST", 3)
+    goal = turned(robot, 0.5, (0.0, 1.0, 0.0))
+    with any_wording(), pytest.raises(fflin.InputError, match="move in loops"):
+        fflin.plan(robot, (goal, None), 5.0, knots=6, free=FREE_OF_JOINTS)
+
+
 ARM = {"tau_b": 6.0, "F_b": 3.5, "tau_m": 3.0}
 
 

@@ -43,7 +43,7 @@ def test_the_solution_meets_the_conditions_of_optimality():
     """The slopes of the Lagrangian are the prices of the bounds: none inside, outwards at a hard
     one, no more than `soft` at a soft one and just that beyond it."""
     qp = problem()
-    x, u, y = solved()
+    x, u, y, _ = solved()
     A, B, D = np.split(qp["ends"], (NX, NX + NU), axis=2)
     w = np.hstack((x, u))
     after = [A[k] @ x[k] + B[k] @ u[k] + D[k] @ u[k + 1] + qp["c"][k] for k in range(N)]

@@ -300,6 +300,7 @@ def sound(folder):
         "plan": {
             **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
             **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},
+            "guess": None,
         },
         "plot_campaign": {
             "campaign": campaign,

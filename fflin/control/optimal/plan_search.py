@@ -1,6 +1,5 @@
 """Search for a plan by sequential quadratic programming with multiple shooting."""
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -95,14 +94,14 @@ class Models(NamedTuple):
 
     ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
     rows: sp.csr_array  # one row for each limit
-    at_knots: tuple[Indices, ...]  # knot and state of the first rows
-    within: tuple[Indices, ...]  # interval, part and state of the other rows
+    at_knots: tuple[Indices, Indices]  # knot and state of the first rows
+    within: tuple[Indices, Indices, Indices]  # interval, part and state of the other rows
 
     def room(self, trial: Trial) -> Array:
         """Return the lower and upper limits (2, m) of the rows about a trial."""
-        knot, state = self.at_knots
-        k, part, limited = self.within
-        room: Array = np.hstack((trial.knots[:, knot, state], trial.inside[:, k, part, limited]))
+        knot, limit = self.at_knots
+        k, part, state = self.within
+        room: Array = np.hstack((trial.knots[:, knot, limit], trial.inside[:, k, part, state]))
         return room
 
 
@@ -145,8 +144,8 @@ class Search(NamedTuple):
         """Return the trial of least effort, and how nearly it is stationary.
 
         The search begins at the knots q, v and the inputs u. If the search fails, return the motion
-        under the last inputs, and None. The effort is the sum of ``cost * u**2``. `iterations` is the
-        number of earlier iterations.
+        under the last inputs, and None. The effort is the sum of ``cost * u**2``. `iterations` is
+        the number of earlier iterations.
         """
         shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
@@ -228,8 +227,8 @@ class Search(NamedTuple):
         """
         least = np.clip(u - gradient / self.cost, *self.limits)
         distance = float((self.cost * (u - least) ** 2).sum())
-        size = float((self.cost * u**2).sum())
-        return math.sqrt(distance / (size or 1.0))
+        effort = float((self.cost * u**2).sum()) or 1.0
+        return float(np.sqrt(distance / effort))
 
     def _merit(self, trial: Trial, price: Array, limited: Mask) -> float:
         """Return the effort plus the costs of the gaps and the violations of a trial."""
