@@ -161,10 +161,10 @@ def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int
 
 
 def count(name: str, value: object, least: int = 1, largest: int = MOST) -> int:
-    """Return how many things a call makes, or raise `InputError`.
+    """Return the number of objects that a call makes, or raise `InputError`.
 
-    The number is limited before memory is taken for the things. If the store of the things checks
-    its own size, call `whole` instead.
+    The limit is checked before memory is allocated. If the container of the objects checks its own
+    size, call `whole` instead.
     """
     return whole(name, value, least, largest)
 

@@ -379,9 +379,12 @@ def _momentum(lin: fflin.LinearModel) -> str:
         return folded([f"no reduction: {error}"])
     if len(reduced.momenta):
         components = counted(len(reduced.momenta), "component")
+        # The reduction also removes wheels, whose torques change the momentum of the other bodies.
+        removed = {f"q_m.{name}" for name in lin.wheels} - {*reduced.state_names}
+        bodies = " of the robot without its wheels" if removed else ""
         text = (
-            f"{components} of the momentum cannot be changed by any input; the model reduced "
-            f"by the conserved momentum has {len(reduced.A)} states"
+            f"{components} of the momentum{bodies} cannot be changed by any input; the model "
+            f"reduced by the conserved momentum has {len(reduced.A)} states"
         )
     elif not lin.is_equilibrium():
         text = (

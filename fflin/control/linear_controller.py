@@ -16,7 +16,7 @@ import numpy as np
 from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.names import undotted
 from fflin.base.record import read_record, reading, texts
-from fflin.base.validation import Array, Indices, Mask, as_double, instance, number, shaped
+from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
@@ -263,7 +263,7 @@ def _growing_feedback(policy: object, held: float) -> tuple[str, ...]:
     return _unstable("sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice)
 
 
-def _on_feedback(A: Array, K: Array) -> tuple[Indices, Indices]:
+def _on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
     """Return rows and columns of the states that affect the states that the gain K feeds back.
 
     Other states, such as the position of a base that no input pushes, may drift in a stable loop.

@@ -132,25 +132,36 @@ def draft(robot: Robot, urdf: str) -> str:
     idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
     names = ", ".join(_text(joint.name) for joint in idle)
     passive = f"\n# Joints without a motor: their effort is 0 in the URDF.\npassive = [{names}]\n"
+    mark = ""  # before the springs and dampers that are guessed
     if len(idle) == robot.n:
+        mark = "# "
         passive = (
-            "\n# The URDF gives every joint an effort of 0, as some exporters do.\n"
+            "\n# The URDF gives every joint an effort of 0, as some exporters do. If the joints\n"
+            "# have no motors, uncomment this line, and the springs and dampers below.\n"
             f"# passive = [{names}]\n"
         )
-        idle = []
     M = pin.crba(model, model.createData(), robot.neutral())
     inertia = {joint.name: float(M[joint.idx_v, joint.idx_v]) for joint in idle}
-    damping = {name: 2.0 * _DAMPED * _SWING * size for name, size in inertia.items()}
-    damping |= {name: value for name, value in robot.urdf_damping.items() if value}
+    known = {name: value for name, value in robot.urdf_damping.items() if value}
+    guessed = {name: 2.0 * _DAMPED * _SWING * size for name, size in inertia.items()}
+    damping = {mark + _text(name): guessed[name] for name in guessed if name not in known}
+    damping |= {_text(name): value for name, value in known.items()}
     limits = {
         f"# {_text(name)}": f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
         for name, (low, high) in limits_of(robot).items()
     }
     candidates, spun = _candidates(robot)
+    on_base = [
+        frame.name
+        for frame in model.frames.tolist()
+        if frame.parentJoint == ROOT and frame.type == pin.FrameType.BODY
+    ]
     joint = _text(robot.joint_names[0] if robot.n else "joint_1")
     tables = {
-        "damping": {_text(name): f"{value:.6g}" for name, value in damping.items()},
-        "stiffness": {_text(name): f"{size * _SWING**2:.6g}" for name, size in inertia.items()},
+        "damping": {key: f"{value:.6g}" for key, value in damping.items()},
+        "stiffness": {
+            mark + _text(name): f"{size * _SWING**2:.6g}" for name, size in inertia.items()
+        },
         "limits": limits,
     }
     template = Template((Path(__file__).parent / "assets" / "robot.toml").read_text("utf-8"))
@@ -161,6 +172,7 @@ def draft(robot: Robot, urdf: str) -> str:
         mass=f"{robot.mass:.6g}",
         urdf=_text(urdf),
         joint=joint,
+        frame=_text(on_base[0] if on_base else "root_joint"),
         passive=passive if names else "",
         candidates=candidates,
         lock=", ".join(spun) or joint,

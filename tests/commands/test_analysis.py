@@ -61,3 +61,15 @@ def test_validity_says_whether_inputs_were_cut():
     _, cut, _ = run(*asked, "--limits", "urdf")
     assert says(free.splitlines()[-1], "--limits urdf")
     assert says(cut.splitlines()[-1], "limits")
+
+
+def test_wheels_change_the_momentum_of_the_other_bodies(tmp_path):
+    """Wheels alone cannot change the 3 linear momenta of the body that carries them."""
+    wheels = [
+        f'[[input]]\ntype = "reaction_wheel"\naxis = {axis}\ninertia = 1e-3\n'
+        for axis in ([1, 0, 0], [0, 1, 0], [0, 0, 1])
+    ]
+    (tmp_path / "wheels.toml").write_text("".join(wheels))
+    code, out, _ = run("analyze", "cubesat", "--inputs", "wheels.toml", cwd=tmp_path)
+    assert code == 0
+    assert says(out, "3 components of the momentum of the robot without its wheels cannot be")

@@ -132,6 +132,27 @@ def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):
     assert robot.passive == () and len(fflin.linearize(robot).u0) == 13
 
 
+def test_a_bus_with_unactuated_wings_becomes_a_robot_by_uncommenting(tmp_path):
+    """The springs are suggested, and the frame of appendages is the root link, here "bus"."""
+    text = OWN.replace('effort="2"', 'effort="0"').replace('"base"', '"bus"')
+    (tmp_path / "own.urdf").write_text(text)
+    assert run("init", "own.urdf", cwd=tmp_path)[0] == 0
+    written = (tmp_path / "own.toml").read_text()
+    wing = r'# "hinge 1" = [0-9.]+\n'
+    assert re.search(r"\[stiffness\]\n(# .*\n)*" + wing, written)
+    taken = re.sub(r"(?m)^# (passive = )", r"\1", written)
+    springs, rest = taken.split("# [rest]")
+    taken = re.sub(r'(?m)^# (?="(hinge 1|spin)" = [0-9.]+$)', "", springs) + "# [rest]" + rest
+    appendage = re.search(r"# \[\[flexible\]\]\n(#.*\n)*?(?=# \[\[slosh)", written)[0]
+    taken = taken.replace(appendage, re.sub(r"(?m)^# ", "", appendage))
+    (tmp_path / "taken.toml").write_text(taken)
+    robot = fflin.load(tmp_path / "taken.toml")
+    assert set(robot.passive) == {"hinge 1", "spin"} <= set(robot.stiffness)
+    assert robot.stiffness["hinge 1"] == pytest.approx(0.4 * np.pi**2, rel=1e-5)
+    assert robot.damping["hinge 1"] == 0.3 and robot.damping["spin"] > 0.0
+    assert robot.appendages[0].frame == "bus"
+
+
 def test_a_file_names_its_urdf_from_where_it_lies(tmp_path):
     (tmp_path / "deep" / "er").mkdir(parents=True)
     (tmp_path / "a b.urdf").write_text(OWN)
