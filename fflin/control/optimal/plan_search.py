@@ -181,7 +181,8 @@ class Search(NamedTuple):
                     break
                 near = _MORE * near
             if moved is None:
-                if not small or bool((near <= 1.1 * _LEAST * first).all()):
+                # After failed attempts, the reduction is small only because the cost was raised.
+                if not small or attempt > 0 or bool((near <= 1.1 * _LEAST * first).all()):
                     break
                 near = np.maximum(_LESS * near, _LEAST * first)
                 continue
