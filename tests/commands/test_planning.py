@@ -11,6 +11,7 @@ from tests.support.commands import refused, run
 ROBOT = "planar_detumble"
 
 
+@pytest.mark.exhaustive
 def test_a_plan_is_followed(tmp_path):
     locked = ("--lock", "joint_2", "--lock", "joint_3")
     target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)

@@ -68,7 +68,8 @@ CHAIN = {
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-@pytest.mark.parametrize("robot", mostly(ROBOTS, "planar_detumble"))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_a_report_of_a_trajectory_and_of_many_runs_is_too(robot, tmp_path):
     (tmp_path / "spread.toml").write_text('[dispersions]\n"base.mass" = 0.1\nq_b = 0.05\n')
     fflin.simulate(fflin.load(robot), duration=2.0, dt=0.1).trajectory().save(tmp_path / "plan.npz")

@@ -544,6 +544,7 @@ def loop():
 FREE_OF_JOINTS = ["r_b", "v_b", "omega_b"]
 
 
+@pytest.mark.exhaustive
 def test_a_guess_of_joints_that_move_in_loops_rotates_the_base(loop):
     robot, known = loop
     goal = (known.q[-1], known.v[-1])
@@ -572,6 +573,7 @@ def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(loop, mo
 ARM = {"tau_b": 6.0, "F_b": 3.5, "tau_m": 3.0}
 
 
+@pytest.mark.exhaustive
 def test_long_steps_are_corrected(monkeypatch):
     """From the same iterations, a search without second-order corrections needs more effort."""
     robot = fflin.load("planar_detumble", lock=["joint_3"])

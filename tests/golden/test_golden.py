@@ -8,6 +8,7 @@ from tests.support.robots import mostly
 
 # Not without numba, and not by engine: models are made in Python.
 LONG = [f"policies {kind} ets_vii" for kind in ("followed", "followed_outputs")]
+LONG += ["funnel", "validity"]
 QUICK = [case for case in cases() if case not in LONG]
 COMPILED = [case for case in cases() if not case.startswith("models")]
 

@@ -16,6 +16,7 @@ from fflin.kernel.tree import laid_out
 from fflin.simulation.lanes import noises, packed
 from fflin.simulation.plan import Plan, SimulationOptions
 from fflin.simulation.run import STOPS, Plant, go, stop_conditions, stop_of
+from tests.support.marks import exhaustive
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
 from tests.support.policies import (
@@ -29,7 +30,13 @@ from tests.support.policies import (
     plain,
     shared,
 )
-from tests.support.robots import FRAMES, free_body, random_point, random_pose, random_tree
+from tests.support.robots import (
+    FRAMES,
+    free_body,
+    random_point,
+    random_pose,
+    random_tree,
+)
 from tests.support.weights import unit_weights
 
 
@@ -108,14 +115,17 @@ def test_the_mechanics_are_those_of_pinocchio_under_every_policy(robots, make):
     assert np.abs(u).max() > 1e-3
 
 
-@pytest.mark.parametrize("make", [outputs, controlled_in_samples, followed_outputs])
+@pytest.mark.parametrize("make", [outputs, controlled_in_samples, *exhaustive(followed_outputs)])
 def test_samples_of_one_step_agree_with_pinocchio(robots, make):
     robot, policy, options = make(plain(robots["ets_vii"]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
     both(planned(robot, policy, **{"x0": x0} | options | {"dt": SAMPLE, "duration": 2.5}))
 
 
-@pytest.mark.parametrize(("make", "dt"), [(followed, 0.4), (followed_outputs, SAMPLE)])
+@pytest.mark.parametrize(
+    ("make", "dt"),
+    [(followed, 0.4), pytest.param(followed_outputs, SAMPLE, marks=pytest.mark.exhaustive)],
+)
 def test_a_trajectory_that_ends_before_the_run_agrees_with_pinocchio(robots, make, dt):
     robot, policy, options = make(plain(robots["ets_vii"]))
     both(planned(robot, policy, **options, dt=dt, duration=9.2))

@@ -259,6 +259,7 @@ def test_the_prediction_is_the_exact_exponential():
     np.testing.assert_allclose(limited.linear[-1], exact, atol=1e-4 * np.abs(exact).max())
 
 
+@pytest.mark.exhaustive
 def test_a_schedule_with_a_large_final_weight_ends_on_its_trajectory():
     robot = fflin.load("planar_detumble")
     v0 = fflin.velocity(robot, {"joint_1": 0.1})
