@@ -498,6 +498,13 @@ def reduced_gradient(robot, motion, held):
     return np.linalg.norm(left) / np.linalg.norm(u)
 
 
+def test_a_plan_whose_quadratic_programs_are_not_solved_is_refused(one_joint, monkeypatch):
+    monkeypatch.setattr(plan_search.Search, "_step", lambda *_, **__: None)
+    robot, goal = one_joint
+    with pytest.raises(fflin.InputError, match="no motion"):
+        fflin.plan(robot, (goal, None), 10.0, knots=11)
+
+
 @pytest.mark.parametrize("hold", ["previous", *exhaustive("linear")])
 def test_a_search_that_stops_early_states_its_gradient(one_joint, monkeypatch, hold):
     robot, goal = one_joint

@@ -159,7 +159,7 @@ class Search(NamedTuple):
             models = self._models(trial, limited)
             if models is None:
                 return self._flown(trial.u), None
-            moved = None
+            moved, small = None, False
             for attempt in range(_MOST_TRIES):
                 step = self._step(trial, models, near, cost * trial.u)
                 if step is None:  # the solver failed
