@@ -159,7 +159,8 @@ class Search(NamedTuple):
             models = self._models(trial, limited)
             if models is None:
                 return self._flown(trial.u), None
-            moved, small = None, False
+            moved = step = None
+            small = False
             for attempt in range(_MOST_TRIES):
                 step = self._step(trial, models, near, cost * trial.u)
                 if step is None:  # the solver failed
@@ -195,7 +196,9 @@ class Search(NamedTuple):
             if converged and (limited == known).all():
                 break
         iterations += iteration + 1
-        if _ENDS < trial.outside(limited) <= _HOPELESS and self.price < _LARGEST_PRICE:
+        # A dearer search does not help if the solver failed.
+        dear = self.price >= _LARGEST_PRICE or step is None
+        if _ENDS < trial.outside(limited) <= _HOPELESS and not dear:
             dearer = self._replace(price=_RAISE * self.price)
             return dearer.best(trial.q, trial.v, trial.u, iterations)
         trial = self._closed(trial, limited, first, left)
