@@ -23,6 +23,10 @@ ULPS, FEW_ULPS = 64.0, 8.0
 # ratio of 25 was observed in such a column.
 _SAFETY, _SAFETY_OF_ZERO = 20.0, 200.0
 
+# The square of a rounding error may remain in place of a zero, for example in a velocity that is
+# converted from a state. Up to this size, in units, an entry counts as zero.
+_NOTHING = 1e-30
+
 # {block: its rows or columns}
 Blocks = Mapping[Any, slice | Sequence[int] | Indices]
 
@@ -101,11 +105,12 @@ def scales(
     """Return the scale of each entry of a matrix from its size.
 
     The scale is the size. If the size is zero, the scale is the largest size in the block. If the
-    block is zero, the scale is one unit.
+    block is zero, the scale is one unit. Sizes up to _NOTHING units count as zero.
     """
     largest = block_sizes(rows, columns, sizes, row_units, column_units)
     unit = np.outer(row_units, 1.0 / column_units)
-    return np.where(sizes > 0.0, sizes, np.where(largest > 0.0, largest, unit))
+    least = _NOTHING * unit
+    return np.where(sizes > least, sizes, np.where(largest > least, largest, unit))
 
 
 def sampled(rows: Blocks, value: Array, others: Sequence[Array], row_units: Array) -> Array:

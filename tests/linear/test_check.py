@@ -341,3 +341,12 @@ def test_aba_of_light_links_with_mimic_joints_is_accurate(seed):
     rows = slice(len(route.M), None)
     units = np.outer(route.mobility, route.input_mobility)
     assert np.abs((route.B.value - lin.B)[rows] / units).max() < 1e-13
+
+
+def test_a_velocity_that_is_zero_but_for_rounding_is_no_scale():
+    robot = fflin.load("servicer_7dof")
+    tug = robot.replace(stiffness={"panel_left": 100.0, "panel_right": 100.0}, damping=0.5)
+    q = fflin.configuration(tug, {"joint_2": 0.4, "joint_4": -1.1})
+    v = fflin.velocity(tug, {"joint_1": 0.1, "omega_b.z": 0.02})
+    lin = fflin.linearize(tug, q, v, fflin.effort(tug, {"tau_m.joint_1": 2.0}))
+    assert fflin.check(tug, lin).ok
