@@ -346,10 +346,13 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     """Format a linear combination of names.
 
     At most `most` terms are written, those with the largest ``abs(weights) * sizes``. The other
-    terms are counted.
+    terms are counted. The first term is positive, because the sign of a direction has no meaning.
     """
-    order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
-    largest = abs(weights[order[0]]) * sizes[order[0]]
+    shares = np.abs(weights) * sizes
+    largest = float(shares.max())
+    # Rounding must not decide the order of terms of the same size.
+    order = [i for i in np.argsort(-np.round(shares / largest, 6), kind="stable") if weights[i]]
+    weights = weights * np.sign(weights[order[0]])
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
     terms: list[str] = []
     for i in shown[:most]:
