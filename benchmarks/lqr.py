@@ -24,8 +24,8 @@ from scipy.linalg import solve_continuous_are
 import fflin
 from fflin.control.optimal.riccati import Riccati, solve
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from conftest import BUNDLED, random_tree
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.support.robots import BUNDLED, random_tree
 
 
 def shortest(*functions: Callable[[], object], repetitions: int = 60) -> list[float]:
