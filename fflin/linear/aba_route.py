@@ -175,9 +175,13 @@ class Route:
 
     def _nudged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return q, v and the inputs in base axes, changed by _NUDGE."""
-        state, scales = self.state, [joint.scale for joint in self.state.robot.joints]
-        size = np.concatenate((np.ones(6), scales))
-        step = state.spread(_NUDGE * rng.choice((-1.0, 1.0), len(size)) / size)
+        state, (stiffness, _, rest) = self.state, self.state.robot.springs
+        per_unit = np.array([1.0 / joint.scale for joint in state.robot.joints])
+        # The rounding error of a spring's force is relative to the deflection of the spring.
+        deflection = np.abs(state.joint_positions(self.q) - rest)
+        per_unit = np.where(stiffness > 0.0, np.minimum(per_unit, deflection), per_unit)
+        size = np.concatenate((np.ones(6), per_unit))
+        step = state.spread(_NUDGE * rng.choice((-1.0, 1.0), len(size)) * size)
         faster = 1.0 + _NUDGE * rng.choice((-1.0, 1.0), len(size))
         stronger = 1.0 + _NUDGE * rng.choice((-1.0, 1.0), len(self._u))
         q = pin.integrate(state.robot.model, self.q, step)

@@ -326,7 +326,7 @@ class References:
         size[:, nv:nx] = (still + route.rate_terms(steps[nv:nx]))[:, None]
         size = size / steps + np.hstack((route.sums_A, route.sums_B))
         rounding = ULPS * EPS * size
-        rounding += sampled(g._asdict(), slopes, [again], route.units)
+        rounding += sampled(g._asdict(), slopes, again, route.units)
         # Differences may be exactly zero where M^-1, and so the model, has rounding errors.
         rounding = np.maximum(rounding, np.hstack((route.A.rounding, route.B.rounding)))
         return (

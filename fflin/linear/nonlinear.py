@@ -108,20 +108,29 @@ class Nonlinear:
         return float((np.abs(expected - rates) / scale).max())
 
 
-# Ratio of the steps of the two differences of `jacobians`.
-_STEP_RATIO = 1.5
+# Each repetition of the differences of `jacobians` has steps that are divided by a ratio, and
+# another point. The point differs by _NEGLIGIBLE of the steps, with the sign of the second value.
+_REPETITIONS = (1.5, 1.0), (1.2, -1.0)
+
+# Fraction of a step that changes the rounding errors of a function, but not its derivatives.
+_NEGLIGIBLE = 1e-12
 
 
 def jacobians(
     f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask
-) -> tuple[Array, Array]:
-    """Return the Jacobian of f at a point, computed twice by central differences.
+) -> tuple[Array, list[Array]]:
+    """Return the Jacobian of f at a point by central differences, and repetitions of it.
 
-    The second Jacobian has smaller steps than the given ones. The difference between the two shows
-    the truncation error and the rounding error of the first one.
+    The repetitions have smaller steps than the given ones. Their attitude and joint positions
+    differ by a negligible fraction of the steps, so that all rounding errors are independent. The
+    differences between the Jacobians show the truncation error and the rounding error of the first
+    one.
     """
-    smaller = steps / _STEP_RATIO
-    return jacobian(f, point, steps, is_curved), jacobian(f, point, smaller, is_curved)
+    again = []
+    for ratio, sign in _REPETITIONS:
+        beside = point + sign * _NEGLIGIBLE * steps * is_curved
+        again.append(jacobian(f, beside, steps / ratio, is_curved))
+    return jacobian(f, point, steps, is_curved), again
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, Indices
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.outputs import Measuring, state_indices
 from fflin.dynamics.state import StateMap
@@ -28,6 +28,11 @@ from fflin.linear.scales import (
     spread_over,
     worst,
 )
+from fflin.robot.joints import find_frame
+
+# Number of rows with the contributions of a body: its share of the centre of mass, its linear and
+# its angular momentum.
+_PER_BODY = 9
 
 
 class OutputReference:
@@ -93,8 +98,24 @@ class OutputReference:
         groups, ny = state.groups, len(lin.y0)
         is_curved = np.zeros(len(x), dtype=bool)
         is_curved[groups.q_b] = is_curved[groups.q_m] = True
-        here = self._evaluate(x[None])[0]
-        by_x, again = jacobians(self._evaluate, x, steps, is_curved)
+        here = self._evaluate(x[None], self._a)[0]
+        # h is linear in the accelerations, so its derivatives by velocities do not depend on them.
+        # Without them, h is small, and so are its rounding errors.
+        nv, steady = len(x) // 2, np.zeros_like(self._a)
+        unaccelerated = self._evaluate(x[None], steady)[0]
+
+        def differences(part: slice, a: Array) -> Array:
+            def outputs(values: Array) -> Array:
+                points = np.tile(x, (len(values), 1))
+                points[:, part] = values
+                return self._evaluate(points, a)
+
+            first, again = jacobians(outputs, x[part], steps[part], is_curved[part])
+            return np.array([first, *again])
+
+        by_positions = differences(slice(nv), self._a)
+        by_velocities = differences(slice(nv, None), steady)
+        by_x, *again = np.concatenate((by_positions, by_velocities), axis=2)
 
         parts = {k: np.arange(k, k + 3) for k in range(ny, len(here), 3)}
         vectors, ones = {**self._vectors, **parts}, np.ones(len(here))
@@ -102,28 +123,36 @@ class OutputReference:
         reach = sum(float(np.linalg.norm(place.translation)) for place in places)
         reach += float(np.linalg.norm(lin.q[:3]))
         least = {"rad": 1.0, "1": 1.0, "m": reach}
-        sizes = np.abs(here) + np.abs(by_x) @ np.abs(x)
-        sizes[:ny] += [least.get(unit, 0.0) for unit in lin.output_units]
-        sizes = spread_over(vectors, sizes[:, None], ones)
+        moved = np.abs(by_x) * np.abs(x)
+        whole = np.abs(here) + moved.sum(axis=1)
+        sizes = np.column_stack((whole, np.abs(unaccelerated) + moved[:, nv:].sum(axis=1)))
+        sizes[:ny] += np.array([least.get(unit, 0.0) for unit in lin.output_units])[:, None]
+        sizes = spread_over(vectors, sizes, ones)
         # The differences of a vector that does not depend on a variable are exactly zero.
-        depends = spread_over(vectors, np.abs(by_x) + np.abs(again), ones) > 0.0
-        # But the model itself may have rounding errors of the size of h per radian.
-        per_unit = np.zeros(len(x))
-        per_unit[groups.q_b] = 2.0
-        per_unit[groups.r_b] = 1.0 / reach if reach else 0.0
-        per_unit[groups.q_m] = [body.scale for body in state.robot.joints]
-        rounding = FEW_ULPS * EPS * sizes * (depends / steps + per_unit)
-        rounding += sampled(vectors, by_x, [again], ones)
+        depends = spread_over(vectors, np.abs(by_x) + np.abs(again).max(axis=0), ones) > 0.0
+        # But the model itself may have rounding errors of the size of h per radian, unless nothing
+        # that the joint moves is measured.
+        per_unit = np.zeros(by_x.shape)
+        per_unit[:, groups.q_b] = 2.0
+        per_unit[:, groups.r_b] = 1.0 / reach if reach else 0.0
+        per_joint = [body.scale for body in state.robot.joints]
+        per_unit[:, groups.q_m] = _moved_by(state, len(here)) * per_joint
+        by_column = np.repeat(sizes, nv, axis=1)
+        rounding = FEW_ULPS * EPS * by_column * (depends / steps + per_unit)
+        rounding += sampled(vectors, by_x, again, ones)
         total = self._bodies.sums(here, ny, self._kinds, lin.reference.rotation)
         size = np.abs(total)
-        return total @ by_x, size @ rounding, (size @ sizes)[:, 0]
+        return total @ by_x, size @ rounding, size @ sizes[:, 0]
 
-    def _evaluate(self, x: Array) -> Array:
-        """Return h (N, ny) for states (N, nx), followed by the contributions of the bodies."""
+    def _evaluate(self, x: Array, a: Array) -> Array:
+        """Return h (N, ny) for states (N, nx), followed by the contributions of the bodies.
+
+        `a` (nv,) is dv/dt as Pinocchio's ABA returns it.
+        """
         _, q, v = self._route.state.points(x)
         rows = []
         for point in zip(x, q, v, strict=True):
-            y = self._measuring(*point, self._a)
+            y = self._measuring(*point, a)
             rows.append(np.append(y, self._bodies(self._measuring)))
         return np.array(rows)
 
@@ -220,6 +249,34 @@ class _Bodies:
             write(kinds["momentum"][:3], skew(momentum), -skew(center), unit)
             write(kinds["momentum"][3:], none, unit, none)
         return total
+
+
+def _moved_by(state: StateMap, count: int) -> Mask:
+    """Return which joints (n,) move what each row of h (count,) measures.
+
+    The first rows of h are the outputs. The other rows, if there are any, are contributions of the
+    bodies. An output that consists of states is moved by no joint.
+    """
+    robot = state.robot
+    model = robot.model
+    names = model.names.tolist()
+    leaders = {follower.joint.name: follower.leader.name for follower in robot.followers}
+
+    def movers(carrier: int) -> list[bool]:
+        support = [names[joint] for joint in model.supports[carrier].tolist()]
+        moving = {leaders.get(name, name) for name in support}
+        return [joint.name in moving for joint in robot.joints]
+
+    rows: list[list[bool]] = []
+    for output in robot.outputs:
+        size = len(output.signals) or len(state_indices(state, output))
+        carriers = [find_frame(model, name).joint for name in output.frames]
+        moved = [any(each) for each in zip(*map(movers, carriers), strict=True)]
+        rows += [moved or [False] * robot.n] * size
+    if count > len(rows):
+        for carrier in range(model.njoints):
+            rows += [movers(carrier)] * _PER_BODY
+    return np.array(rows, dtype=bool).reshape(count, robot.n)
 
 
 def _parts(state: StateMap) -> tuple[dict[str, list[int]], dict[int, Indices]]:

@@ -147,7 +147,7 @@ def _pulses(engine):
     K = 0.1 * np.random.default_rng(3).normal(size=lin.B.shape[::-1])
     K[12:, 9:12] = -0.02 * np.eye(3)
     policy = fflin.StateFeedback(replace(lin.discretize(0.1), u0=0.01 + 0.0 * lin.u0), K)
-    options = {"x0": displaced(lin), "duration": 4.0, "dt": 0.02, "delay": 0.14, "limits": "urdf"}
+    options = {"x0": displaced(lin), "duration": 2.0, "dt": 0.02, "delay": 0.14, "limits": "urdf"}
     return _flown(robot, policy, engine, **options)
 
 

@@ -33,6 +33,7 @@ VARIES = [
     (re.escape(tempfile.gettempdir()) + r"/fflin-\w+", "TMP"),
     (re.escape(str(Path.home())), "HOME"),
     (r"[\d.,]+ [kMGTP]B\b", "SIZE"),
+    (r"tcp://[\d.]+:\d+", "ADDRESS"),
     (r"\(choose from [^)]*\)", "(choose from CHOICES)"),
     # Texts of NumPy, and lists of SciPy's distributions, which depend on their versions.
     (r"\((This file contains|Cannot load file containing) pickled.*", "(PICKLED)"),
