@@ -1,15 +1,15 @@
-"""The sentences of fflin that the tests meet, all of them in tests/messages.json.
+"""The sentences of fflin that the tests meet, one of each template in tests/messages.json.
 
 A test asserts the class of an error or a warning and one keyword of its sentence. While it runs,
 `pytest.raises`, `pytest.warns` and `commands.run` note the whole sentence by `hear`; at its end the
-sentences must be those of the snapshot. `pytest --write-messages` writes them to it: of tests that
-passed, where a sentence changed, but not where an error has another class than before; and it
-removes those of tests that are gone from a file that was collected whole.
+template of each sentence must be one of the snapshot. The template is the sentence without its
+figures and quoted names, so the figures are for the tests themselves to assert.
+`pytest --write-messages` adds new sentences, of tests that passed. If all tests ran, it also
+removes the sentences that no test met.
 """
 
 import contextlib
 import json
-import math
 import re
 import tempfile
 from pathlib import Path
@@ -41,16 +41,22 @@ VARIES = [
     (r"(maximum recursion depth exceeded)[a-zA-Z ]*", r"\1"),
 ]
 LONGEST = 400
-NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
+NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+QUOTED = re.compile(r"(?<!\w)'[^']*'(?!\w)")
+
+
+def template(sentence):
+    """Return a sentence without its figures and its quoted names."""
+    return QUOTED.sub("'...'", NUMBER.sub("#", sentence))
 
 
 def hear(text, kind=""):
-    """Note a sentence of the test that runs, once for all its figures; return it as it was said."""
+    """Note a sentence of the test that runs, once for each template; return the text itself."""
     noted = text.strip()
     for pattern, word in VARIES:
         noted = re.sub(pattern, word, noted)
     noted = f"{kind}: {noted}"[:LONGEST] if kind else noted[:LONGEST]
-    if all(NUMBER.sub("", noted) != NUMBER.sub("", each) for each in HEARD):
+    if template(noted) not in map(template, HEARD):
         HEARD.append(noted)
     return text
 
@@ -104,43 +110,24 @@ def warns(*arguments, **options):
             hear(str(each.message), each.category.__name__)
 
 
-def same(one, other):
-    """Whether two sentences agree, figures but for what differs between processors."""
-    pairs = list(zip(NUMBER.split(one), NUMBER.split(other), strict=False))
-    return len(NUMBER.split(one)) == len(NUMBER.split(other)) and all(
-        x == y or (k % 2 and _close(x, y)) for k, (x, y) in enumerate(pairs)
-    )
+class Snapshot:
+    """The sentences of tests/messages.json, by their templates."""
 
+    def __init__(self, path):
+        self.path = path
+        sentences = json.loads(path.read_text("utf-8")) if path.exists() else []
+        self.sentences = {template(sentence): sentence for sentence in sentences}
 
-def _close(one, other):
-    if one.isdigit() and other.isdigit():
-        return False
-    return math.isclose(float(one), float(other), rel_tol=0.02, abs_tol=1e-6)
+    def missing(self, heard):
+        """Return the sentences whose template is not in the snapshot."""
+        return [sentence for sentence in heard if template(sentence) not in self.sentences]
 
-
-def differences(noted, heard):
-    """Return the lines that say where the sentences of a test are not those of the snapshot."""
-    lines = []
-    for k in range(max(len(noted), len(heard))):
-        old = noted[k] if k < len(noted) else "(nothing)"
-        new = heard[k] if k < len(heard) else "(nothing)"
-        if not same(old, new):
-            lines += [f"  noted: {old}", f"  heard: {new}"]
-    return lines
-
-
-def classes(sentences):
-    """Return the class of each sentence, empty where it is a line of a command or a report."""
-    return [re.match(r"(?:\w+(?:Error|Warning)(?=: ))?", said)[0] for said in sentences]
-
-
-def merged(noted, heard, gone):
-    """Return the snapshot with the sentences of the tests that ran, without tests that are gone."""
-    whole = {test: said for test, said in noted.items() if test not in gone}
-    for test, said in heard.items():
-        if differences(whole.get(test, []), said):
-            whole[test] = said
-    return {test: said for test, said in whole.items() if said}
+    def write(self, heard, whole):
+        """Add sentences; if all tests were run (`whole`), also remove those that were not heard."""
+        new = {template(sentence): sentence for sentence in heard}
+        kept = {key: said for key, said in self.sentences.items() if key in new or not whole}
+        text = json.dumps(sorted((new | kept).values()), indent=1, ensure_ascii=False)
+        self.path.write_text(text + "\n", encoding="utf-8")
 
 
 class Messages:
@@ -148,13 +135,10 @@ class Messages:
 
     def __init__(self, config):
         self.config = config
-        self.path = config.rootpath / "tests" / "messages.json"
+        self.snapshot = Snapshot(config.rootpath / "tests" / "messages.json")
         self.write = config.getoption("write_messages")
-        self.noted = self.read()
-        self.heard, self.gone, self.narrowed = {}, [], set()
-
-    def read(self):
-        return json.loads(self.path.read_text("utf-8")) if self.path.exists() else {}
+        self.heard = {}
+        self.narrowed = False
 
     @pytest.hookimpl(wrapper=True)
     def pytest_pyfunc_call(self, pyfuncitem):
@@ -163,52 +147,29 @@ class Messages:
             patch.setattr(pytest, "raises", raises)
             patch.setattr(pytest, "warns", warns)
             result = yield
-        test = pyfuncitem.nodeid
-        self.heard[test] = HEARD.copy()
-        noted = self.noted.get(test, [])
-        wrong = differences(noted, HEARD)
-        if wrong and not self.write:
-            head = f"sentences that differ from {self.path.name}; `{COMMAND}` writes them to it:"
-            pytest.fail("\n".join([head, *wrong]), pytrace=False)
-        if len(noted) == len(HEARD) and classes(noted) != classes(HEARD):
-            del self.heard[test]
-            head = (
-                f"errors of another class; where that is meant, take the test out of {self.path}:"
-            )
-            pytest.fail("\n".join([head, *wrong]), pytrace=False)
+        self.heard[pyfuncitem.nodeid] = HEARD.copy()
+        missing = self.snapshot.missing(HEARD)
+        if missing and not self.write:
+            head = f"not in {self.snapshot.path.name}, to which `{COMMAND}` writes:"
+            pytest.fail("\n  ".join([head, *missing]), pytrace=False)
         return result
 
     def pytest_deselected(self, items):
-        self.narrowed |= {_file(item.nodeid) for item in items}
-
-    def pytest_collection_finish(self, session):
-        tests = {item.nodeid for item in session.items}
-        chosen = any("::" in str(each) for each in self.config.args)
-        whole = set() if chosen else {_file(test) for test in tests} - self.narrowed
-        self.gone = [
-            test
-            for test in self.noted
-            if (_file(test) in whole and test not in tests)
-            or not (self.config.rootpath / _file(test)).exists()
-        ]
+        self.narrowed = self.narrowed or bool(items)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node):
         self.heard |= getattr(node, "workeroutput", {}).get("heard", {})
-        self.gone += getattr(node, "workeroutput", {}).get("gone", [])
+        self.narrowed = self.narrowed or getattr(node, "workeroutput", {}).get("narrowed", True)
 
-    def pytest_sessionfinish(self):
+    def pytest_sessionfinish(self, exitstatus):
         if hasattr(self.config, "workeroutput"):
-            self.config.workeroutput |= {"heard": self.heard, "gone": self.gone}
+            self.config.workeroutput |= {"heard": self.heard, "narrowed": self.narrowed}
         elif self.write:
-            whole = merged(self.read(), self.heard, self.gone)
-            text = json.dumps(whole, indent=1, sort_keys=True, ensure_ascii=False)
-            self.path.write_text(text + "\n", encoding="utf-8")
+            default = self.config.getini("testpaths") or [str(self.config.invocation_params.dir)]
+            whole = exitstatus == 0 and not self.narrowed and self.config.args == default
+            self.snapshot.write([each for heard in self.heard.values() for each in heard], whole)
             errors_page.write(self.heard)
-
-
-def _file(test):
-    return test.partition("::")[0]
 
 
 def pytest_addoption(parser):
