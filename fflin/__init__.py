@@ -85,6 +85,7 @@ _PUBLIC = {
     "Sweeps": {
         "batch.sweep": "sweep",
         "batch.linear_batch": "LinearBatch",
+        "batch.tool_batch": "ToolBatch",
         "batch.gains": "lqr_batch GainBatch",
         "batch.configurations": "grid Grid random_configurations RandomConfigurations",
     },

@@ -135,6 +135,7 @@ from fflin.campaign.validity import Validity as Validity
 # Sweeps
 from fflin.batch.sweep import sweep as sweep
 from fflin.batch.linear_batch import LinearBatch as LinearBatch
+from fflin.batch.tool_batch import ToolBatch as ToolBatch
 from fflin.batch.gains import lqr_batch as lqr_batch
 from fflin.batch.gains import GainBatch as GainBatch
 from fflin.batch.configurations import grid as grid

@@ -25,6 +25,7 @@ from fflin.robot.rotors import FlownWheels
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array, Indices, Mask
+    from fflin.batch.tool_batch import ToolBatch
     from fflin.robot.robot import Robot
 
 # Identity placement of the free-flyer joint in Pinocchio's universe frame: position, then
@@ -159,6 +160,18 @@ class LinearBatch(ModelHeader):
         return self.x0 if self._y0 is None else self._y0
 
     @property
+    def placements(self) -> Array:
+        """References (N, 7) of the points: position [m] and quaternion x, y, z, w."""
+        if self._reference is not None:
+            return self._reference
+        bases = self.q[:, :7]
+        if (self._root[0] == AT_ROOT).all():
+            return bases
+        root = pin.XYZQUATToSE3(np.array(self._root[0]))
+        placed = [pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(np.array(base))) for base in bases]
+        return frozen(np.array(placed))
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints in state order."""
         return _joints(self.state_names)
@@ -207,6 +220,36 @@ class LinearBatch(ModelHeader):
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
             )
         return self[mask]
+
+    def to(self, tool: str, *, dt: float | None = None) -> ToolBatch:
+        """Return the models in the coordinates of another tool.
+
+        Points whose bases have the same attitude, twist, acceleration and inputs are converted
+        together, which is much faster than one at a time.
+
+        Parameters
+        ----------
+        tool, dt
+            See `transform`.
+
+        Raises
+        ------
+        InputError
+            If the batch was loaded without its robot, or `dt` is not allowed for the tool.
+        UnknownNameError
+            If the tool is unknown.
+        ChartError
+            If the tool uses Euler angles and their pitch is 90 deg at a point.
+        """
+        from fflin.batch.tool_batch import tool_batch
+
+        robot = self[0]._robot if len(self) else None
+        if robot is None:
+            raise InputError(
+                "the batch does not contain its robot; load it with "
+                "fflin.LinearBatch.load(path, robot)"
+            )
+        return tool_batch(robot, self, tool, dt)
 
     def save(self, path: str | Path) -> None:
         """Write the batch to a file, atomically.
