@@ -93,7 +93,8 @@ def seen(traj: LinearTrajectory, known: Array) -> Split:
 
 def _refined(traj: LinearTrajectory) -> LinearTrajectory:
     """Return the trajectory with at least nx intervals, so that few knots do not limit a rank."""
-    intervals, nx = len(traj.t) - 1, len(traj.state_names)
+    intervals = len(traj.t) - 1
+    nx = len(traj.state_names)
     if traj.dt or intervals >= nx:
         return traj
     parts = intervals * math.ceil(nx / intervals)

@@ -380,7 +380,8 @@ def _by_second_order(
     - the name of the method;
     - the fixed poles.
     """
-    source, R = mechanics.at_rest(lin), conserved.rates
+    source = mechanics.at_rest(lin)
+    R = conserved.rates
     if source is None:
         return None
     system, r = mechanics.second_order(source).restricted(R), len(conserved.kept)
@@ -403,7 +404,8 @@ def _by_second_order(
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.
-    exact, scale = ranks.Noisy.exact(rows), 1.0 / np.tile(system.size, 2)
+    exact = ranks.Noisy.exact(rows)
+    scale = 1.0 / np.tile(system.size, 2)
     controllable, _ = ranks.null_space(exact, scale)
     to_s = np.linalg.inv(
         (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
@@ -415,7 +417,8 @@ def _by_second_order(
     # Without damping, the uncontrollable combinations of states are modal coordinates of vibrations
     # and instabilities, and the rates of these coordinates.
     members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
-    read, names = [np.zeros((0, 2 * r))], list[str]()
+    read = [np.zeros((0, 2 * r))]
+    names = list[str]()
     for pole, of_pole in shapes:
         if pole.real < 0.0:  # the pole with positive real part has the same shapes
             continue
@@ -439,7 +442,8 @@ def require_stabilizable(lin: LinearModel) -> None:
             missed += ", or remove the damping of the wheels"
         said = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
         return _conclude(StabilizabilityError, *said)
-    found, words = controllability(lin), ""
+    found = controllability(lin)
+    words = ""
     if not found.stabilizable:
         # The message names the momenta and the other uncontrollable states that do not decay. It
         # omits the coordinates whose rates are the momenta.
@@ -457,7 +461,8 @@ def _lasting(lin: LinearModel, found: Controllability, first: int) -> tuple[str,
     The combinations are the rows of the result `found` from the row `first` on. The rows before it
     are conserved.
     """
-    rows, names = found.rows, found.uncontrollable[first:]
+    rows = found.rows
+    names = found.uncontrollable[first:]
     if found.method == "modes" or not names:
         return names  # undamped vibrations and instabilities
     # The combinations z = rows x obey dz/dt = F z, because they span a left invariant subspace.
@@ -593,7 +598,9 @@ def _reached(
         shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
         matrix = np.column_stack((shifted, B))
         # Rows and columns have different units, so they are scaled to comparable sizes.
-        rows, columns, scaled = np.ones(len(matrix)), np.ones(matrix.shape[1]), matrix
+        rows = np.ones(len(matrix))
+        columns = np.ones(matrix.shape[1])
+        scaled = matrix
         for _ in range(4):
             rows /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=1)))
             columns /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=0)))

@@ -162,7 +162,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     M = state.to_base(chart, state.to_base(chart, lin.M).T)
     order = np.arange(len(M))
     order[:6] = np.r_[order[LINEAR], order[ANGULAR]]
-    M, stiffness = M[np.ix_(order, order)], robot.springs.stiffness
+    M = M[np.ix_(order, order)]
+    stiffness = robot.springs.stiffness
     springs, others = 6 + np.flatnonzero(stiffness), 6 + np.flatnonzero(stiffness == 0.0)
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
@@ -189,7 +190,8 @@ def _separated(frequencies: Array, L: Array) -> Array:
 
     The columns of L (6, k) are the participation factors of the modes.
     """
-    L, first = L.copy(), 0
+    L = L.copy()
+    first = 0
     while first < len(frequencies):
         near = frequencies <= (1.0 + _EQUAL) * frequencies[first]
         last = int(np.count_nonzero(near))

@@ -163,7 +163,8 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
             pole = refined
         if (np.abs(known - at) < _SAME_POLE).any():
             continue
-        rank, single = int((values > tolerance).sum()), abs(at.imag) <= _SAME_POLE
+        rank = int((values > tolerance).sum())
+        single = abs(at.imag) <= _SAME_POLE
         margin &= ranks.judged(values / tolerance, U, rank, 1 if single else 2)
         vectors = U[:, rank:]
         if not vectors.shape[1]:
@@ -216,7 +217,8 @@ def unobservable(
     basis, at_origin = ranks.null_space(seen @ np.diag(scale))
     margin = at_origin.transformed(1.0 / system.size, halved=True) & margin
     at_zero = basis * scale[:, None]
-    motions, poles = [at_zero], [0j] * at_zero.shape[1]
+    motions = [at_zero]
+    poles = [0j] * at_zero.shape[1]
     decays: list[ranks.Decision] = []
     missed: list[tuple[complex, Values]] = []
     for start in starts:
@@ -228,7 +230,8 @@ def unobservable(
             continue
         # If a pole has fewer independent eigenvectors than its multiplicity, the test is
         # inconclusive.
-        D, sizes = system.D.values, np.abs(shapes)
+        D = system.D.values
+        sizes = np.abs(shapes)
         change = shapes.T @ (2.0 * pole * system.M + D) @ shapes
         size = sizes.T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(D)) @ sizes
         least = np.linalg.svd(change, compute_uv=False)[-1]

@@ -133,7 +133,8 @@ class SecondOrder:
             found = np.linalg.eigvals(A) * fastest
         else:
             roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
-            found, zeros = np.concatenate((roots, -roots)), 2 * zeros
+            found = np.concatenate((roots, -roots))
+            zeros = 2 * zeros
         found = found[np.argsort(np.abs(found))][zeros:]
         return found[found.imag >= 0.0], margin & other
 
@@ -144,7 +145,9 @@ def second_order(lin: LinearModel) -> SecondOrder:
     # `without_rounding` sets an entry to zero if it is clearly below a bound on its rounding error.
     # For K and D, this bound is at least a fraction of the largest entry of the matrix, in units of
     # energy. For S, the norm of the column replaces the largest entry.
-    nv, M, X = len(lin.M), lin.M, rate_matrix(lin)
+    nv = len(lin.M)
+    M = lin.M
+    X = rate_matrix(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * ranks.EPS * np.abs(rates)
@@ -203,7 +206,8 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
     # A continuous model is a second-order system if the rates of the positions depend on the
     # velocities alone. A sampled model without a known continuous model is accepted only if no
     # force depends on the state: (A - I)/dt then has the structure of a continuous model.
-    source, nv = lin.generator or lin, len(lin.M)
+    source = lin.generator or lin
+    nv = len(lin.M)
     X = rate_matrix(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
         return None

@@ -200,7 +200,8 @@ class Modes:
 
     def __str__(self) -> str:
         """Show the number of rigid-body modes, and a table of the other modes."""
-        vibrations, others = len(self.vibrations), len(self.modes) - len(self.vibrations)
+        vibrations = len(self.vibrations)
+        others = len(self.modes) - len(self.vibrations)
         head = (
             f"{self.robot}: {counted(self.rigid_body, 'rigid-body mode')} "
             f"({counted(self.zero_eigenvalues, 'eigenvalue')} at zero), "
@@ -321,7 +322,8 @@ def modes(lin: LinearModel) -> Modes:
     # the accelerations with respect to the positions. Derivatives that are no larger than these
     # errors are set to zero.
     A = lin.A.copy()
-    by_position, rounding = A[nv:, :nv], np.abs(lin.B[nv:]) @ np.abs(lin.u0)
+    by_position = A[nv:, :nv]
+    rounding = np.abs(lin.B[nv:]) @ np.abs(lin.u0)
     by_position[np.abs(by_position) <= 1e2 * EPS * rounding[:, None]] = 0.0
     # Scale the states and the time so that the largest entries of A are about 1.
     rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
@@ -344,7 +346,8 @@ def modes(lin: LinearModel) -> Modes:
         # for symmetric panels, the shape is scaled by the first of them.
         positions = np.abs(shape[:nv])
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
-        shape, margin = np.asarray(shape / shape[largest], complex), scaled_pole.real / error
+        shape = np.asarray(shape / shape[largest], complex)
+        margin = scaled_pole.real / error
         found.append((pole, shape, margin))
     shapes = np.array([shape for _, shape, _ in found], complex).reshape(len(found), 2 * nv)
     energies = energies_of(lin._robot, lin, shapes)
@@ -448,7 +451,8 @@ def _energies(robot: Robot, q: Array, v: Array) -> Array:
     """
     # The twists of all k motions are propagated together, from each body to the next. This needs a
     # single pin.Data, whose construction costs more than the rest of this function.
-    model, data = robot.model, robot.create_data()
+    model = robot.model
+    data = robot.create_data()
     pin.forwardKinematics(model, data, q, np.zeros(model.nv))
     twists = np.zeros((model.njoints, 6, v.shape[1]))
     energies = np.zeros((model.njoints, v.shape[1]))
@@ -479,7 +483,8 @@ def nonzero_eigenpairs(
     # error. Zero eigenvalues are therefore removed before the others are computed. Singular values
     # of at most n * tolerance count as zero. So the caller must scale A (n, n) so that its largest
     # entries are about 1.
-    n, whole = len(A), A
+    n = len(A)
+    whole = A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
     steps: list[Array] = []

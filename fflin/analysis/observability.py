@@ -129,7 +129,9 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
     if not lin.is_equilibrium():
         return _in_motion(lin)
     nv = len(lin.M)
-    source, method, motions = mechanics.at_rest(lin), "eigenvalues", None
+    source = mechanics.at_rest(lin)
+    method = "eigenvalues"
+    motions = None
     if source is not None:
         system = mechanics.second_order(source)
         N = mechanics.rates_of_positions(mechanics.rate_matrix(source))

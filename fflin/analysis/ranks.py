@@ -31,7 +31,8 @@ _LASTING = 1e-6
 # The threshold of a force is its rounding error, but at least _FLOOR times the largest force in the
 # matrix. A force below the threshold may be a rounding error. A force below _ROUNDING times the
 # threshold is set to zero.
-_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
+_FLOOR = 1e3 * EPS
+_ROUNDING = 0.3
 
 
 class Decision(NamedTuple):
@@ -213,7 +214,8 @@ def right_vectors(
     rows = rows if np.imag(rows).any() else np.real(rows)
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
     singular = np.pad(singular, (0, n - len(singular)))
-    rank, vectors = int((singular > tolerance).sum()), right.conj().T
+    rank = int((singular > tolerance).sum())
+    vectors = right.conj().T
     return singular, vectors, rank, judged(singular / tolerance, vectors, rank, states)
 
 

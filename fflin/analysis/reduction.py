@@ -293,8 +293,10 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     """
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)
-    model, data = robot.model, robot.create_data()
-    index, axes = frame_index(model, frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    model = robot.model
+    data = robot.create_data()
+    index = frame_index(model, frame)
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)
@@ -315,7 +317,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     """
     # A wheel speed affects other states if the link that carries the wheel rotates at the operating
     # point, or if the wheel has friction.
-    nv, wanted = len(lin.M), {f"q_m.{name}" for name in lin.wheels}
+    nv = len(lin.M)
+    wanted = {f"q_m.{name}" for name in lin.wheels}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
         return at, at

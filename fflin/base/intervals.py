@@ -57,7 +57,8 @@ def quantile(values: Array, p: float, confidence: float) -> Estimate:
     count = len(values)
     ordered = np.concatenate(([-np.inf], np.sort(values), [np.inf]))
     # The number of values below the quantile has a binomial distribution.
-    below, tail = bdtr(np.arange(count + 1.0), count, p), (1.0 - confidence) / 2.0
+    below = bdtr(np.arange(count + 1.0), count, p)
+    tail = (1.0 - confidence) / 2.0
     low, high = np.searchsorted(below, (tail, 1.0 - tail)).tolist()
     middle = min(max(math.ceil(p * count), 1), count)
     return Estimate(*map(float, (ordered[middle], ordered[low], ordered[min(high, count) + 1])))

@@ -51,7 +51,8 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
     found: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
-        first, of = i, [unit]
+        first = i
+        of = [unit]
         if found and found[-1][2] == group and (group or unit in found[-1][3]):
             first, _, _, of = found.pop()
             of = list(dict.fromkeys((*of, unit)))

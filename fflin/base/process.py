@@ -58,7 +58,8 @@ class Progress:
         if self._shown:
             share = done / total
             spent = time.monotonic() - self._start
-            left, hint = spent * (1.0 - share) / share, hint if spent > LONG_RUN else ""
+            left = spent * (1.0 - share) / share
+            hint = hint if spent > LONG_RUN else ""
             bar = "#" * round(30 * share)
             self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
@@ -68,7 +69,8 @@ class Progress:
         A text is ignored if it comes less than 0.1 s after the last shown text.
         """
         if self._shown and (now := time.monotonic()) >= self._next:
-            self._next, self._drawn = now + _INTERVAL, True
+            self._next = now + _INTERVAL
+            self._drawn = True
             print(f"\r\x1b[2K{text}", end="", file=sys.stderr, flush=True)
 
     def close(self) -> None:

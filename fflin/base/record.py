@@ -234,7 +234,8 @@ def _unpacked_size(content: bytes) -> int:
     """
     order: Literal["little", "big"] = "little" if content[126:128] == b"IM" else "big"
     data = memoryview(content)
-    at, total = _MAT_HEADER, 0
+    at = _MAT_HEADER
+    total = 0
     while at + 8 <= len(data):
         kind = int.from_bytes(data[at : at + 4], order)
         size = int.from_bytes(data[at + 4 : at + 8], order)
@@ -366,7 +367,8 @@ class Design(Result):
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
         """Read a file as `load` does; `given` contains the fields that files do not store."""
-        source, name = writing.as_path(path), cls.__name__
+        source = writing.as_path(path)
+        name = cls.__name__
         with reading(source, name):
             record, verified = read_record(source)
             if text(record["kind"]) != name:

@@ -95,7 +95,8 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     ]
     # Columns that do not fit into the terminal's width follow below, in blocks that omit rows of
     # zeros.
-    label, used = max(map(len, rows)), 0
+    label = max(map(len, rows))
+    used = 0
     folds: list[list[int]] = []
     for j, name in enumerate(columns):
         if not values[:, j].any():

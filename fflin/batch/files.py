@@ -177,7 +177,9 @@ class MemoryStore:
         given: Mapping[str, Array] | None = None,
     ) -> None:
         # The arrays in `given` are not copied.
-        self.count, self.chunk, self.arrays = count, chunk, dict(given or {})
+        self.count = count
+        self.chunk = chunk
+        self.arrays = dict(given or {})
         self._finished = set[int]()  # first rows of the finished chunks
         try:
             if 8 * count * sum(map(math.prod, shapes.values())) > memory():
@@ -233,7 +235,9 @@ class FileStore:
         constants: Mapping[str, Array],
         texts: Mapping[str, str],
     ) -> None:
-        self.path, self.part, self.count = path, part_of(path), count
+        self.path = path
+        self.part = part_of(path)
+        self.count = count
         self._shapes, self._constants = shapes, constants
         self._texts = {**texts, "constant": json.dumps(list(constants))}
         _remove_empty(self.part)

@@ -378,7 +378,8 @@ class LinearBatch(ModelHeader):
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         require_known("joint", joints, self.joint_names)
         at = {name: self.joint_names.index(name) for name in joints}
-        q_m, turning = self.joint_positions, [second >= 0 for _, second, _ in self.columns]
+        q_m = self.joint_positions
+        turning = [second >= 0 for _, second, _ in self.columns]
         return [(f"joint '{x}'", q_m[:, k], turning[k], joints[x]) for x, k in at.items()]
 
 

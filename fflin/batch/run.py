@@ -94,7 +94,8 @@ class Execution(ExitStack):
             bar = ProgressBar()
             self.progress = bar
             self.callback(bar.close)
-        self.executor, self._threads = executor, threads or available_cores()
+        self.executor = executor
+        self._threads = threads or available_cores()
         if workers is not None:
             self.executor = self.enter_context(OwnWorkers(workers))
 
@@ -151,7 +152,8 @@ def run_chunks(
     in memory, the attribute `batch` of this error is the result of ``made(arrays)``, where `arrays`
     contains the rows and results of the other chunks. If all chunks fail, `batch` is None.
     """
-    left, done = list[Span](), 0
+    left = list[Span]()
+    done = 0
     for start in range(0, store.count, store.chunk):
         stop = min(start + store.chunk, store.count)
         if store.finished(start, stop):
@@ -202,7 +204,8 @@ def _results(
         except FflinError as error:
             return str(error)
 
-    count, inside = how.count(job), how.executor is None
+    count = how.count(job)
+    inside = how.executor is None
     if inside and (count == 1 or len(spans) == 1):
         for span in spans:
             yield span, here(*span)
@@ -399,7 +402,8 @@ def _starting() -> Iterator[None]:
     """
     from multiprocessing import resource_tracker, util
 
-    names, key = vars(util), "_args_from_interpreter_flags"
+    names = vars(util)
+    key = "_args_from_interpreter_flags"
     with _TURN:
         usual = names[key]
         names[key] = lambda: ["-I", *usual()]

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 # Limits of the default chunk size: bytes (configurations plus results), and number of rows. A chunk
 # must take much longer to compute than to send, and several chunks must fit into memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
-_LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
+_LEAST_CHUNK = 16
+_LARGEST_CHUNK = 2**16
 
 # Only one thread at a time may change the warning filters, because all threads share them.
 _TURN = Lock()
@@ -150,7 +151,9 @@ def sweep(
     linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
     job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
     task = SweepTask(job, q, v, u)
-    count, size, row = task.count, chunk, job.row_bytes
+    count = task.count
+    size = chunk
+    row = job.row_bytes
     if size is None:
         # Choose the chunk size such that all threads or workers compute about equally many chunks.
         same = how.count(job)
@@ -176,7 +179,9 @@ def sweep(
 
 def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
     """Return the compiled kernel for accelerations and derivatives, or None if Python is used."""
-    robot, tree, reason = prepared.robot, batch_tree(prepared.robot), ""
+    robot = prepared.robot
+    tree = batch_tree(prepared.robot)
+    reason = ""
     if prepared.sensing is not None:
         reason = "the outputs are not the state"
     elif not numba_is_there():
@@ -202,13 +207,15 @@ class ChunkJob:
 
     def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
         self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
-        self.linearizer, prepared = linearizer, linearizer.prepared
+        self.linearizer = linearizer
+        prepared = linearizer.prepared
         self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
         # A and f0 are the same at all points if the robot is at rest, no forces such as springs or
         # gravity act on it (`free`), and each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
-        nx, nu = prepared.map.nx, len(prepared.actuation.names)
+        nx = prepared.map.nx
+        nu = len(prepared.actuation.names)
         ny = len(prepared.common["output_names"])
         # Shapes, per point, of the arrays that differ between points.
         self.shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
@@ -226,7 +233,8 @@ class ChunkJob:
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Linearise about the points of a chunk; see `Job`."""
-        left, nv = self.write(rows, out), self.shapes["B_lower"][0]
+        left = self.write(rows, out)
+        nv = self.shapes["B_lower"][0]
         if not len(left):
             return []
         with _TURN, warnings.catch_warnings(record=True) as caught:
@@ -245,12 +253,14 @@ class ChunkJob:
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
         """Write results into `out` by compiled code; return the indices of the skipped rows."""
-        kernel, q = self._kernel, rows["q"]
+        kernel = self._kernel
+        q = rows["q"]
         count = len(q)
         if kernel is None:
             return np.arange(count)
         if count < LANES:  # fill up the lanes by repeating the last row
-            filled, more = ((0, LANES - count), (0, 0)), dict[str, Array]()
+            filled = ((0, LANES - count), (0, 0))
+            more = dict[str, Array]()
             for key, array in out.items():
                 more[key] = np.empty((LANES, *array.shape[1:]))
             left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
@@ -268,8 +278,13 @@ class ChunkJob:
         self, kernel: RowAccelerations, rows: Rows, out: Mapping[str, Array]
     ) -> Mask:
         """Write the models about points at rest or in motion; return the mask of valid rows."""
-        ready, q, A, B = self.linearizer.prepared, rows["q"], out["A"], out["B_lower"]
-        state, actuation, count = ready.map, ready.actuation, len(q)
+        ready = self.linearizer.prepared
+        q = rows["q"]
+        A = out["A"]
+        B = out["B_lower"]
+        state = ready.map
+        actuation = ready.actuation
+        count = len(q)
         own = ready.own_reference
         chart: Chart = Standing(count) if own else state.charts(q)
         r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
@@ -279,7 +294,8 @@ class ChunkJob:
             nu = state.velocities(rows["v"])
         if "u0" in rows:
             u = actuation.in_base_axes(chart, rows["u0"])
-        q_m, nv = state.joint_positions(q), nu.shape[1]
+        q_m = state.joint_positions(q)
+        nv = nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
         c, good = kernel.write(q, nu, q_m, u, A, B)
         rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
@@ -307,8 +323,10 @@ class SweepTask:
         v: ArrayLike | None,
         u: ArrayLike | None,
     ) -> None:
-        self.job, self.robot = job, (robot := job.linearizer.robot)
-        prepared, root = job.linearizer.prepared, robot.model.jointPlacements[ROOT]
+        self.job = job
+        self.robot = (robot := job.linearizer.robot)
+        prepared = job.linearizer.prepared
+        root = robot.model.jointPlacements[ROOT]
         # `_points` generates configurations on demand; it is None if q is an array. `_known`
         # contains the given arrays. A single v or u for all points is broadcast to one row per
         # point.

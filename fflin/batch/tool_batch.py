@@ -175,7 +175,8 @@ class _Points:
 
     def change(self, rows: Indices) -> tuple[_Change, Array]:
         """Return the change of coordinates of a group, and the rates dy/dt of its points."""
-        batch, first = self._batch, rows[0]
+        batch = self._batch
+        first = rows[0]
         reference = pin.XYZQUATToSE3(self._placements[first])
         state = StateMap(self._robot, reference=reference, frame=batch.frame)
         own = ToolCoordinates(state, moving=batch.moving)

@@ -70,7 +70,10 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
                 f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
                 "'attitude < 1 deg'"
             )
-        name, sign, limit, unit = kind_named(match[1]), match[2], float(match[3]), match[4]
+        name = kind_named(match[1])
+        sign = match[2]
+        limit = float(match[3])
+        unit = match[4]
         values, own = figure(name)
         factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
@@ -240,7 +243,8 @@ class Campaign(FrozenArrays):
             return self.settle[:, at].max(axis=1, initial=0.0), "s"
         of, _, rest = name.partition(" ")
         if of not in ("worst", "settle", "drawn"):
-            of, rest = "final", name
+            of = "final"
+            rest = name
         indices = {WHEEL_SPEEDS: self._indices("qdot_m", self.wheels)}
         indices[MODES] = self._indices("q_m", self.modes)
         if indices.get(rest) and of in ("final", "worst"):

@@ -71,7 +71,8 @@ class Dispersions:
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
-        robot, reads = plant.robot, decider(policy)
+        robot = plant.robot
+        reads = decider(policy)
         self._model = robot._bare.model
         sensors = tuple[str, ...]()
         if isinstance(reads, StateFeedback):
@@ -97,7 +98,8 @@ class Dispersions:
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
             if kind not in kinds or not head:
-                head, kind = str(key), "delay" if key == "delay" else "state"
+                head = str(key)
+                kind = "delay" if key == "delay" else "state"
             own, tied = untied(str(key), spread)
             if kind == "fails" and isinstance(own, int | float):
                 raise InputError(
@@ -141,7 +143,8 @@ class Dispersions:
         common name is not empty, all quantities that match the key share the column with this name,
         or one such column for each axis. `kinds` is the text that lists all kinds in messages.
         """
-        robot, names = self._plant.robot, self._known[kind]
+        robot = self._plant.robot
+        names = self._known[kind]
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
@@ -161,7 +164,8 @@ class Dispersions:
         except UnknownNameError as error:
             hint = f"; or NAME.({kinds})" * (kind == "state")
             raise UnknownNameError(f"{error}{hint}") from None
-        nominal, of_modes = robot.springs._asdict(), robot.springs.stiffness[self._modes]
+        nominal = robot.springs._asdict()
+        of_modes = robot.springs.stiffness[self._modes]
         factors = {**nominal, "frequency": of_modes}.get(kind)
         draws: dict[str, tuple[Inverse, list[int]]] = {}
         for at, (inverse, tied) in sorted(found.items()):
@@ -193,8 +197,11 @@ class Dispersions:
         that match the same link or body. If the key names a body of several links, it also
         overrides patterns that match these links.
         """
-        robot, found, named = self._plant.robot, dict[str, tuple[Inverse, str]](), dict[str, str]()
-        alone, whole = {*robot.pieces, *robot.link_of}, set[int]()
+        robot = self._plant.robot
+        found = dict[str, tuple[Inverse, str]]()
+        named = dict[str, str]()
+        alone = {*robot.pieces, *robot.link_of}
+        whole = set[int]()
         for key in sorted(spreads, key=alone.__contains__):  # names come last to override patterns
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
@@ -299,7 +306,8 @@ class Dispersions:
         inertias are about the centres of mass.
         """
         robot, model = self._plant.robot, self._model
-        pieces, dispersed = [*robot.pieces.values()], set[int]()
+        pieces = [*robot.pieces.values()]
+        dispersed = set[int]()
         mass, com, inertia, density = map(self._of, _OF_BODIES, repeat(drawn))
         for column in self.columns:
             if column.kind in _OF_BODIES:
@@ -387,7 +395,9 @@ class Dispersions:
 
     def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
         """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
-        plant, policy, rows = self._plant, fresh(self._policy), drawn[None]
+        plant = self._plant
+        policy = fresh(self._policy)
+        rows = drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
         if bodies:
@@ -484,7 +494,9 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     The arrays contain the wrenches of the inputs, the stored momenta, the joint placements, and the
     changes of the body parameters. Each array has one row per run.
     """
-    model, count, names = robot._bare.model, len(angles), list(robot.model.names)
+    model = robot._bare.model
+    count = len(angles)
+    names = list(robot.model.names)
     wrench = np.tile(tree.wrench, (count, 1)).reshape(count, -1, 6)
     stored = np.tile(tree.stored, (count, 1)).reshape(count, -1, 3)
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
@@ -505,7 +517,8 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
         if isinstance(item, ReactionWheel) and item.inertia:
             wheel = names.index(own[0]) - ROOT
             fixed[:, wheel, :9] = [(axes @ turned_to(each)).ravel("F") for each in after]
-            a, b = row_products(after, axes.T), axes @ before
+            a = row_products(after, axes.T)
+            b = axes @ before
             change = np.outer(b, b) - a[:, :, None] * a[:, None]
             row, column = np.triu_indices(3)
             bodies[:, body, 4:] += item.inertia * change[:, row, column]

@@ -36,7 +36,9 @@ _ROUNDING = 1e-12  # eigenvalues of the scaled P up to this fraction of the larg
 _PILOTS, _HALVINGS = 16, 40
 # Largest initial error of the attitude [deg], of a revolute joint [rad], and of the position or a
 # prismatic joint [m].
-_LARGEST_ATTITUDE, _LARGEST_ANGLE, _LARGEST_LENGTH = 170.0, np.pi, 1e3
+_LARGEST_ATTITUDE = 170.0
+_LARGEST_ANGLE = np.pi
+_LARGEST_LENGTH = 1e3
 
 
 def ellipsoid_axes(P: Array) -> Array:
@@ -232,7 +234,8 @@ class Funnel(Design):
         return f"Funnel('{self.robot.name}', {m} knots of {count} runs, goal '{self.goal}')"
 
     def _report(self) -> str:
-        count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
+        count = self.outcomes.shape[1]
+        sure = f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
         head += f", and with {self.within} at all times" * bool(self.within)
         head += f"; {count} runs per knot"
@@ -348,7 +351,8 @@ def funnel(
     2
     """
     validation.instance("robot", robot, Robot, "a fflin.Robot")
-    policy, expected = followed(schedule, robot), "a GainSchedule or a TrajectoryFeedback"
+    policy = followed(schedule, robot)
+    expected = "a GainSchedule or a TrajectoryFeedback"
     feedback = validation.instance("schedule", policy, TrajectoryFeedback, expected)
     require_known("option of funnel", options, _OPTIONS)
     samples = validation.count("samples", samples)
@@ -413,7 +417,8 @@ def _tested(
     level is the level whose ellipsoid reaches a bound of the initial errors (_LARGEST_ATTITUDE,
     _LARGEST_ANGLE or _LARGEST_LENGTH).
     """
-    W, joints = ellipsoid_axes(P), job.plant.robot.joints
+    W = ellipsoid_axes(P)
+    joints = job.plant.robot.joints
 
     def simulate(roots: Array) -> Array:
         """Simulate runs from random errors e with sqrt(e' P e) = `roots`; return the outcomes."""

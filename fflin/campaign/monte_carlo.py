@@ -347,7 +347,10 @@ def _earlier(path: Path, request: str) -> Campaign | None:
 
 def _header(job: CampaignJob) -> dict[str, object]:
     """Return the header of a job's campaign: the fields that the job defines, except arrays."""
-    plan, plant, robot, judged = job.plan, job.plant, job.plant.robot, list[str]()
+    plan = job.plan
+    plant = job.plant
+    robot = job.plant.robot
+    judged = list[str]()
     fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
     for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
         if fed_back[part][job.kinds[part] == number].any():

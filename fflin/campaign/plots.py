@@ -27,7 +27,8 @@ _PERCENTILES = (
     (0.95, "95th percentile", "-."),
     (0.99, "99th percentile", ":"),
 )
-_INK, _GOAL = COLORS[0], "#555555"
+_INK = COLORS[0]
+_GOAL = "#555555"
 _WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
 _DECADES, _BARS, _BINS = 6, 10, 48
 
@@ -75,7 +76,8 @@ def plot_campaign(
     """
     instance("campaign", campaign, Campaign, "a Campaign, as fflin.monte_carlo returns it")
     top = whole("worst", worst, 0, len(_WORST))
-    runs, groups = campaign.worst(top) if top else [], dict[str, list[int]]()
+    runs = campaign.worst(top) if top else []
+    groups = dict[str, list[int]]()
     for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
         groups.setdefault(group_of(key), []).append(at)
     kinds = campaign.judged or ("attitude",)
@@ -188,7 +190,8 @@ def plot_funnel(
     >>> figure = fflin.plot_funnel(reach, "funnel.png")
     """
     instance("funnel", funnel, Funnel, "a Funnel, as fflin.funnel returns it")
-    t, percent = funnel.t, 100.0
+    t = funnel.t
+    percent = 100.0
     reach = {
         "attitude [deg]": funnel.attitude,
         "position [m]": funnel.position,
@@ -224,7 +227,8 @@ def _bands(
     # The quantiles are not interpolated between runs, because a mean of a finite value and the edge
     # has no meaning.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
-    shown, t = np.minimum(values[of], most), campaign.times
+    shown = np.minimum(values[of], most)
+    t = campaign.times
     for tail, name, dark in _BANDS:
         low, high = np.quantile(shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf")
         axes.fill_between(t, low, high, color=_INK, alpha=dark, lw=0, label=name)
@@ -240,7 +244,8 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
     history = campaign.error_history[..., list(KINDS).index(kind)]
     _bands(axes, campaign, history, runs)
     ends = np.quantile(history, 0.05, axis=0, method="inverted_cdf")
-    most, least = axes.get_ylim()[1], float(ends[ends > 0.0].min(initial=np.inf))
+    most = axes.get_ylim()[1]
+    least = float(ends[ends > 0.0].min(initial=np.inf))
     if least < 0.05 * most:  # logarithmic, so that small final values are visible
         axes.set(yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most))
     _goals(axes.axhline, campaign, kind)

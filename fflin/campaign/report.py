@@ -18,7 +18,8 @@ _SHARES = (0.5, 0.95, 0.99)
 
 def campaign_report(campaign: Campaign) -> str:
     """Return the report with success rates of goals, error quantiles and rank correlations."""
-    count, quantile = len(campaign), campaign.quantile
+    count = len(campaign)
+    quantile = campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"

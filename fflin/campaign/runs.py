@@ -55,7 +55,8 @@ WHEEL_SPEEDS, MODES = "wheel speeds", "modes"
 EDGE = 176.0
 # LOOK is the number of steps between checks of the condition `CampaignJob.over`. If this condition
 # is None, one call of the compiled loop computes up to _LONG steps.
-LOOK, _LONG = 64, 2**20
+LOOK = 64
+_LONG = 2**20
 
 _LARGEST_CHUNK = 256
 _FEW_STEPS, _SOME_STEPS = 4, 64  # steps timed to estimate the duration of runs
@@ -143,18 +144,21 @@ class CampaignJob:
         self.judge, self.over = judge, over
         self.plant, times = self.plan.plant, self.plan.times
         self.kinds = kinds_of(self.plant.state, self.plan.flown)
-        self.engine, state = lanes.engine_of(engine, self.plan, many=True), self.plant.state
+        self.engine = lanes.engine_of(engine, self.plan, many=True)
+        state = self.plant.state
         self.threaded = self.engine == "compiled"
         self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from `target`: a fixed state (nx,) or the states (steps + 1, nx) of
         # a reference motion. `path` contains q and nu of the reference motion, or is empty.
-        self.target, self.path = self.x0 if self.plan.target is None else self.plan.target, []
+        self.target = self.x0 if self.plan.target is None else self.plan.target
+        self.path = []
         if reference := self.plan.reference:
             t = times.dt * np.arange(times.steps + 1)
             q, v, _ = map(np.array, zip(*map(reference, t.tolist()), strict=True))
             nu = state.velocities(v)
-            self.target, self.path = states_of(state, q, nu), [q.ravel(), nu.ravel()]
+            self.target = states_of(state, q, nu)
+            self.path = [q.ravel(), nu.ravel()]
         given = dict.fromkeys(state.names, 0.0) if given is None else given
         self.given = given
         with placed(given):
@@ -192,7 +196,8 @@ class CampaignJob:
         """
         if self.engine == "python":
             return content_digest(completed(self, first, Execution()))
-        plan, arguments = self.plan, lanes.packed(self.plan, stop_conditions(self.plan))
+        plan = self.plan
+        arguments = lanes.packed(self.plan, stop_conditions(self.plan))
         found: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
         if plan.noise:
             last = min(plan.times.steps, lanes.SLOTS * plan.times.sample)
@@ -244,7 +249,9 @@ class CampaignJob:
         Every step must be recorded. The outcome also contains `state_errors`, the history of the
         state errors. Its entries are NaN after the run was stopped.
         """
-        count, steps, dt = len(run.q), self.steps, self.plan.times.dt
+        count = len(run.q)
+        steps = self.steps
+        dt = self.plan.times.dt
         target = self.target[:count] if self.target.ndim == 2 else self.target
         x, signed = self.errors(run.q, run.v)
         e, u = np.where(self.kinds < 0, 0.0, np.abs(signed)), np.abs(run.u)
@@ -253,7 +260,8 @@ class CampaignJob:
         for kind in range(1, len(KINDS)):
             sizes[:, kind] = e[:, self.kinds == kind].max(axis=1, initial=0.0)
         settled, stop = settled_at(sizes), stop_of(run.stopped)
-        late, kept = is_late(settled, count) | (stop > 0), steps[steps < count]
+        late = is_late(settled, count) | (stop > 0)
+        kept = steps[steps < count]
 
         def history(values: Array, after: float) -> Array:
             found = np.full((len(steps), values.shape[1]), after)
@@ -300,7 +308,10 @@ class CampaignJob:
 
     def seconds(self, first: Array, count: int) -> float:
         """Estimate the time [s] in which one core computes `count` runs, from a few steps."""
-        few, plan, drawn, times = copy(self), self.plan, first[: self.lanes], list[float]()
+        few = copy(self)
+        plan = self.plan
+        drawn = first[: self.lanes]
+        times = list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
         short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
@@ -328,10 +339,15 @@ class RunStatistics(lanes.Statistics):
     span = LOOK
 
     def __init__(self, job: CampaignJob) -> None:
-        self._job, self._state, target = job, job.plant.state, job.target
+        self._job = job
+        self._state = job.plant.state
+        target = job.target
         if job.over is None:
             self.span = _LONG
-        state, initial, kinds, times = self._state, job.plan.initial, len(KINDS), len(job.steps)
+        state = self._state
+        initial = job.plan.initial
+        kinds = len(KINDS)
+        times = len(job.steps)
         first = target if target.ndim == 1 else target[0]
         x, y, z = first[:3].tolist()
         attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
@@ -368,7 +384,8 @@ class RunStatistics(lanes.Statistics):
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return a mask (LANES,) of the runs that `CampaignJob.over` ends, judged by q and v."""
-        over, first = self._job.over, _by_run(self._marks.states[: self._state.nx])
+        over = self._job.over
+        first = _by_run(self._marks.states[: self._state.nx])
         return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
 
     def add(self, first: int, rows: Array) -> None:

@@ -58,7 +58,8 @@ class Loop:
         kept = getattr(gain, "regulated", ())
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))
         if part.state_names == kept:  # omit states that are not fed back and cannot settle
-            K, lin = K @ selection(kept, lin.state_names).T, part
+            K = K @ selection(kept, lin.state_names).T
+            lin = part
         self.robot, self.lin, self.K = robot, lin, K
         # Map between (q, v) and the full state of the robot, in the frame of the model.
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -118,7 +119,8 @@ class Loop:
         The displacements of the base are `attitude` [deg] and `position` [m]. The largest
         displacement of a joint is `joint` [rad|m].
         """
-        g, x = self.state.groups, self.start.copy()
+        g = self.state.groups
+        x = self.start.copy()
         axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
@@ -169,7 +171,8 @@ class Loop:
             )
         if predicts and not lin.dt:
             every = max(1, int(horizon / dt / _CHECKS))
-        checks, finer = math.ceil(horizon / (dt * every) - 1e-9), _FINER**fine
+        checks = math.ceil(horizon / (dt * every) - 1e-9)
+        finer = _FINER**fine
         dt, every = dt / finer, every * finer
         options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
         # Without `limits`, inputs do not saturate, and thrusts can be negative.
@@ -178,7 +181,8 @@ class Loop:
         options |= {"within_chart": True}
         options |= {"histories": checks + 1 if predicts else 1}
         judge = partial(self._judged, self._transition(dt, every) if predicts else None)
-        over, policy = None if predicts else self._is_over, StateFeedback(lin, self.K)
+        over = None if predicts else self._is_over
+        policy = StateFeedback(lin, self.K)
         return CampaignJob(self.robot, policy, None, 0, engine, options, judge, over)
 
     def _transition(self, dt: float, every: int) -> Array:
@@ -211,7 +215,8 @@ class Loop:
         turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
         diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
         code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
-        apart, predicted = np.zeros(len(e)), e[:, 0]
+        apart = np.zeros(len(e))
+        predicted = e[:, 0]
         if step is not None:
             for now in e.swapaxes(0, 1):
                 apart = np.maximum(apart, self.size(now - predicted))

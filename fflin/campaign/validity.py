@@ -111,7 +111,8 @@ class Validity(FrozenArrays):
         trusted, holds, largest = (
             shown(each, self.joint_unit) for each in (self.trusted, self.holds, self.largest)
         )
-        count, sure = len(self.outcomes), f"{100.0 * self.confidence:g} %"
+        count = len(self.outcomes)
+        sure = f"{100.0 * self.confidence:g} %"
         low, high = self.rate
         ends = Counter(self.outcomes)
         failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])

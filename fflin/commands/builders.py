@@ -142,7 +142,8 @@ def state_of(
         for name in ("rpy", "position", "joint", "velocity")
         if (value := getattr(arguments, f"{prefix}{name}", None)) is not None
     }
-    option, names = f"--{prefix}".replace("_", "-"), robot.joint_names
+    option = f"--{prefix}".replace("_", "-")
+    names = robot.joint_names
     values = once(f"{option}joint", given.pop("joint"))
     rates = once(f"{option}velocity", given.pop("velocity", []))
     fflin.velocity(robot, rates)  # raises an error for invalid `rates`

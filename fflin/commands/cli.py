@@ -145,7 +145,8 @@ def _parser(asked: str) -> parser.Command:
 
 def finish(report: Report, arguments: argparse.Namespace) -> int:
     """Write the files of a report, print the report, and return the exit code."""
-    command, said = arguments.command.prog.split()[-1], [report.interrupted]
+    command = arguments.command.prog.split()[-1]
+    said = [report.interrupted]
     written: list[Path] = []
     # Write the files before the report is printed, so that a closed pipe cannot prevent writing
     # them. If writing a file fails, the report is still printed.
@@ -252,11 +253,13 @@ def kind_of(path: Path) -> str:
                 names = {*file, *file.attrs}
         elif path.suffix == ".npz":
             with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
-                names, kind = {*entries}, text(entries.get("kind", ""))
+                names = {*entries}
+                kind = text(entries.get("kind", ""))
         else:
             # Do not call `read_file`, because it would register the file as an input.
             entries, _ = CODECS[path.suffix][1](path.read_bytes())
-            names, kind = {*entries}, text(entries.get("kind", ""))
+            names = {*entries}
+            kind = text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types of errors
         return ""
     return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")

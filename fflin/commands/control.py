@@ -146,7 +146,8 @@ def simulate(arguments: Namespace) -> Report:
     """
     from fflin.simulation.report import motion_record, motion_report
 
-    robot, show = load_robot(arguments), arguments.show
+    robot = load_robot(arguments)
+    show = arguments.show
     check_pictures(robot, arguments)
     if show:
         lin = fflin.linearize(robot)
@@ -276,7 +277,8 @@ def sweep(arguments: Namespace) -> Report:
     from fflin.batch.files import part_of
     from fflin.batch.sweep import ChunkJob
 
-    path, robot = arguments.output_file, load_robot(arguments)
+    path = arguments.output_file
+    robot = load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
     linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes

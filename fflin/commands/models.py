@@ -41,7 +41,9 @@ def robots(_: Namespace) -> Report:
     """
     from fflin.robot.catalog import find_robot
 
-    rows, notes, result = [["name", "n", "mass [kg]", "from"]], [], dict[str, object]()
+    rows = [["name", "n", "mass [kg]", "from"]]
+    notes = []
+    result = dict[str, object]()
     for name in fflin.list_robots():
         found = find_robot(name)
         try:
@@ -157,7 +159,8 @@ def linearize(arguments: Namespace) -> Report:
 
     example: fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat
     """
-    path, tool = arguments.output_file, getattr(arguments, "for")
+    path = arguments.output_file
+    tool = getattr(arguments, "for")
     if tool and not path:
         raise InputError("--for saves the converted model; add -o FILE")
     if path and (tool or arguments.trajectory):
@@ -186,7 +189,8 @@ def check(arguments: Namespace) -> Report:
     """
     if arguments.trajectory:
         along = models_along(arguments)
-        robot, found = along.robot, along.check(tolerance=arguments.tolerance)
+        robot = along.robot
+        found = along.check(tolerance=arguments.tolerance)
         text = f"{found}\n\n{along}"
     else:
         robot, lin = linear_model(arguments)
@@ -229,7 +233,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     matrices = [("A", x, x), ("B", x, u), ("C", y, x), ("D", y, u)]
     of_states = y == x and not lin.D.any()
     for title, rows, columns in matrices[:2] if of_states else matrices:
-        values, text = getattr(lin, title), f"{title} ({len(rows)} x {len(columns)})"
+        values = getattr(lin, title)
+        text = f"{title} ({len(rows)} x {len(columns)})"
         if values.any():
             text += "; rows and columns of zeros are not shown\n\n"
         parts.append(text + (matrix(values, rows, columns) if values.any() else " is zero"))

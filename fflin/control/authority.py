@@ -226,7 +226,8 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     scale = np.linalg.norm(W, axis=1)
     columns = W / scale[:, None]
     columns /= np.linalg.norm(columns, axis=0)
-    subsets, least = combinations(range(W.shape[1]), len(W) - 1), math.inf
+    subsets = combinations(range(W.shape[1]), len(W) - 1)
+    least = math.inf
     while chunk := list(islice(subsets, _FACETS)):
         chosen = columns[:, np.array(chunk)].transpose(1, 0, 2)  # (normals, m, m - 1)
         minors = [np.linalg.det(np.delete(chosen, row, axis=1)) for row in range(len(W))]

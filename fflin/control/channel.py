@@ -75,7 +75,8 @@ def saturation(
         within = within._replace(wheels=limited)
     if not (pulsed and (thrusters := robot.pulsed_thrusters)):
         return within
-    at, time = list(thrusters), sample * dt
+    at = list(thrusters)
+    time = sample * dt
     on_off = np.array([item.on_off for _, item in thrusters.values()])
     least = np.array([item.least_impulse or 0.0 for _, item in thrusters.values()])
     most = np.maximum(high[at], np.finfo(float).tiny)  # a limit of zero
@@ -109,7 +110,8 @@ def warn_beyond(
     bounds = np.where(asked > 0.0, high, low)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
-    worst, exceeded = ratio.argmax(axis=0), ratio.max(axis=0) > 1.0 + 1e-6
+    worst = ratio.argmax(axis=0)
+    exceeded = ratio.max(axis=0) > 1.0 + 1e-6
     if not exceeded.any():
         return
     beyond = [
@@ -137,7 +139,8 @@ class Law:
         u = self.policy(t, q.copy(), v.copy())
         own = type(u) is np.ndarray and u.dtype is DOUBLE
         u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
-        names, shape = self.names, (len(self.names),)
+        names = self.names
+        shape = (len(self.names),)
         if u.shape == shape and math.isfinite(u.dot(u)):
             return u
         if u.shape != shape:

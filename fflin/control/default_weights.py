@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.base.errors import InputError, listed
 from fflin.base.names import state_keys
-from fflin.base.validation import Array, Complex
+from fflin.base.validation import Array, Complex, Mask
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
@@ -102,9 +102,11 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
             "the default weights require; give Q and R"
         )
     pace = pace._replace(bandwidth=max(pace.bandwidth, _OF_FALL * _rate_of_fall(lin)))
-    damping, w = _damping(lin), pace.bandwidth
+    damping = _damping(lin)
+    w = pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
-        before, M = w, lin.M + damping / w
+        before = w
+        M = lin.M + damping / w
         Q, R, rule, w, terms = _of_inertia(lin, M, np.linalg.inv(N), pace, momenta)
         if _NOT_ENOUGH in rule or w > 0.97 * before:
             break
@@ -137,20 +139,14 @@ def _of_inertia(
 
     `inverse` (m, m) maps the rates of the coordinates to the velocities of the model.
     """
-    h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.fraction)
+    h = lin.dt or 1.0
+    m = len(M)
+    size = displacements(lin, pace.fraction)
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
-    cost = (S**2 / D[:, None]).sum(axis=0)
-    if not cost.all():
-        raise InputError(
-            f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
-            "it, or give Q and R"
-        )
-    reach = (S / cost) @ S.T
-    idle = reach.diagonal() <= _IDLE * D
-    reach[idle, idle] = D[idle]
-    reach = _definite(reach, np.sqrt(D))
+    cost = _input_costs(lin, S, D)
+    reach, idle = _effect_of_inputs(S, cost, D)
     ratios, T = eigh(reach, M)
     back = T.T @ M  # T^-1
     # Scale the cost so that the frequency of the slowest mode is the bandwidth w.
@@ -172,7 +168,8 @@ def _of_inertia(
     use = _largest_use(gain, size, lin.state_names)
     speeds = _limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0)
     efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
-    limit, achieved = min([Limit(pace.bandwidth, ""), *speeds, *efforts]), ""
+    limit = min([Limit(pace.bandwidth, ""), *speeds, *efforts])
+    achieved = ""
     rate = rate_matrix(lin)
     loaded = rate[m:].any() or rate[:m, :m].any()
     if loaded:
@@ -198,6 +195,25 @@ def _of_inertia(
     )
     terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
+
+
+def _input_costs(lin: LinearModel, S: Array, D: Array) -> Array:
+    """Return the diagonal of R (nu,), up to a factor: an input costs what it moves."""
+    cost: Array = (S**2 / D[:, None]).sum(axis=0)
+    if not cost.all():
+        raise InputError(
+            f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
+            "it, or give Q and R"
+        )
+    return cost
+
+
+def _effect_of_inputs(S: Array, cost: Array, D: Array) -> tuple[Array, Mask]:
+    """Return S R^-1 S' (m, m), and a mask of the coordinates on which no input has an effect."""
+    reach = (S / cost) @ S.T
+    idle = reach.diagonal() <= _IDLE * D
+    reach[idle, idle] = D[idle]
+    return _definite(reach, np.sqrt(D)), idle
 
 
 def _definite(reach: Array, sizes: Array) -> Array:
@@ -227,7 +243,8 @@ def _on_velocities(
     L = np.linalg.solve(lin.M, root)
     F, H = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L), np.linalg.solve(L, X[m:, m:] @ L)
     _, stiffness, modes = np.linalg.svd(F)
-    own, back = H.T @ H * damped, np.linalg.inv(L)
+    own = H.T @ H * damped
+    back = np.linalg.inv(L)
 
     def at(w: float) -> Array:
         part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
@@ -255,7 +272,8 @@ def _radius_of_gyration(lin: LinearModel) -> float:
 
     It is the radius of a thin spherical shell with the robot's mass and trace of inertia.
     """
-    M, mass = lin.M, lin.M[3, 3]
+    M = lin.M
+    mass = lin.M[3, 3]
     center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
     moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
     return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
@@ -265,7 +283,8 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     """Return the design displacements (m,) of the coordinates, multiplied by `fraction`."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
-    radius, size = 1.0, np.empty(m)
+    radius = 1.0
+    size = np.empty(m)
     if names[:6] == state_keys(())[:6]:
         radius = _radius_of_gyration(lin)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -402,7 +421,8 @@ def _slowed(
         )
         efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
         left, effort = min(efforts, default=Limit(1.0, ""))
-        decay, fast = -rates.real, np.abs(rates)
+        decay = -rates.real
+        fast = np.abs(rates)
         said = (
             f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
             f"1/s, damping ratio at least {(decay / fast).min():.2g}"

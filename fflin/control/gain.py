@@ -165,7 +165,8 @@ class Gain(ModelDesign):
             "warning": "; ".join(cautions(self)),
         }
         fold = partial(textwrap.fill, width=width())
-        rates, margins = rates_of(self.poles, self.dt), self.margins
+        rates = rates_of(self.poles, self.dt)
+        margins = self.margins
         result = (
             f"{len(self.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
             f"smallest damping ratio {float((-rates.real / np.abs(rates)).min()):.2g}"

@@ -108,7 +108,8 @@ class Estimator(ModelDesign):
             If two signals differ only by a dot or an underscore, because python-control has no dots
             in names.
         """
-        L, both = self.L, (*self.input_names, *self.output_names)
+        L = self.L
+        both = (*self.input_names, *self.output_names)
         system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
         return state_space(system, self.dt, self.state_names, both, self.state_names)
 

@@ -139,7 +139,9 @@ class LinearController(Feedback):
         rows = _indices("output", by.outputs, len(by.D), "input", lin.input_names)
         nz, (nu, ny) = len(by.A), lin.D.T.shape
         B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
-        B[:, columns], C[rows], D[np.ix_(rows, columns)] = by.B, self.sign * by.C, self.sign * by.D
+        B[:, columns] = by.B
+        C[rows] = self.sign * by.C
+        D[np.ix_(rows, columns)] = self.sign * by.D
         felt: Mask = np.logical_and(lin.D.any(axis=1), D.any(axis=0))
         if felt.any():
             raise InputError(
@@ -167,7 +169,8 @@ class LinearController(Feedback):
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
-        time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
+        time = f"dt={dt:g} s" if dt else "continuous"
+        nz = len(self.system.A)
         return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
 
     def terms(self, _: float = 0.0) -> Sample:
@@ -183,7 +186,9 @@ class LinearController(Feedback):
         InputError
             If the robot has other states, inputs or outputs than the model. Masses may differ.
         """
-        lin, terms, state = self.lin, self.terms(), self.state_map(robot)
+        lin = self.lin
+        terms = self.terms()
+        state = self.state_map(robot)
         require_fit(lin, robot, state, sensed=True)
         always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
         return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
@@ -191,7 +196,8 @@ class LinearController(Feedback):
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
         """Return the model with the controller's states added, and K and u of the law u + K e."""
         A, B, C, D, u0, y0, *_ = self.terms()
-        apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
+        apart = lin.y0 - y0
+        none = np.zeros((len(lin.A), len(A)))
         both = replace(
             lin,
             A=np.block([[lin.A, none], [B @ lin.C, A]]),
@@ -241,7 +247,8 @@ def _unstable(what: str, matrix: Array, dt: float, advice: str) -> tuple[str, ..
     growth = np.abs(poles) - 1.0 if dt else poles.real
     if not (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
         return ()
-    pole, unit = complex(poles[growth.argmax()]), "" if dt else " 1/s"
+    pole = complex(poles[growth.argmax()])
+    unit = "" if dt else " 1/s"
     return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
 
 

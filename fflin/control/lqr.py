@@ -256,9 +256,11 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
             "lin is sampled, expected a continuous model; for a sampled regulator give the Q and R "
             "of the continuous gain to sampled_cost and lqr"
         )
-    whole, lin = lin, regulated_part(lin, wheel_speeds=False)
+    whole = lin
+    lin = regulated_part(lin, wheel_speeds=False)
     m, half = len(lin.A) // 2, len(whole.A) // 2
-    s, L = lin.A[:m, m:].diagonal(), lin.B[m:]
+    s = lin.A[:m, m:].diagonal()
+    L = lin.B[m:]
     if not np.array_equal(lin.A, np.diag(s, m)) or lin.B[:m].any():
         raise InputError(
             "the model is not a set of double integrators, expected a model at rest without "

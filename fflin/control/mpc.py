@@ -183,8 +183,10 @@ class _Predictive(Feedback):
 
         About a point, e is the deviation x - x0, and the program does not depend on t.
         """
-        of, stages = self.horizon, self.horizon.window(max(number("t", t), 0.0))
-        nx, size = len(stages[0].A), len(of.inputs) * of.samples
+        of = self.horizon
+        stages = self.horizon.window(max(number("t", t), 0.0))
+        nx = len(stages[0].A)
+        size = len(of.inputs) * of.samples
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
         states, z, limited = condensed(stages, planned=False)
         (low, high, soft), free = of.bounds(stages), limited[:, size:] @ start
@@ -437,7 +439,9 @@ class Receding:
     """
 
     def __init__(self, horizon: Horizon, at: Deviation) -> None:
-        self.of, self._at, self._last = horizon, at, -np.inf
+        self.of = horizon
+        self._at = at
+        self._last = -np.inf
         self.solves = self.unfinished = 0
         # For each kind of soft-limit violation: the number of plans or samples with a violation,
         # and the relative magnitude and the description of the largest violation.
@@ -474,7 +478,8 @@ class Receding:
     def step(self, t: float, e: Array) -> Array:
         """Return the command (nu,) minus the reference inputs, at a sample with error e (nx,)."""
         stages = self.of.window(t)
-        now, d = stages[0], -stages[0].K @ e
+        now = stages[0]
+        d = -stages[0].K @ e
         if not self.of.limited:
             return d
         if stages[0] is not self._stages[0]:
@@ -526,13 +531,15 @@ class Receding:
         row, (count, most, said) = int(fractions.argmax()), self._violations[what]
         if fractions[row] > max(most, least):
             sample, at = divmod(row, len(self.of.limited))
-            most, when = float(fractions[row]), t + (sample + 1) * self.of.dt
+            most = float(fractions[row])
+            when = t + (sample + 1) * self.of.dt
             said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
         self._violations[what] = count + bool(fractions[row] > least), most, said
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         self._stages = stages
-        rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
+        rows = condensed(stages, planned=True)[2]
+        size = len(self.of.inputs) * self.of.samples
         low, high, self._soft = self.of.bounds(stages)
         self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)

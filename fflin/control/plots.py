@@ -115,7 +115,8 @@ def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | Non
     >>> figure = fflin.plot_modes(fflin.modes(fflin.linearize(robot)), "modes.png")
     """
     instance("modes", modes, Modes, "Modes, as fflin.modes returns")
-    count, half = len(modes.modes), len(modes.state_names) // 2
+    count = len(modes.modes)
+    half = len(modes.state_names) // 2
     names, units = modes.state_names[:half], modes.state_units[:half]
     title = (
         f"{modes.robot}: {counted(len(modes.vibrations), 'vibration')}, "
@@ -137,7 +138,8 @@ def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | Non
             growth = "grows" if mode.unstable else "decays"
             label = f"real, {growth} in {mode.time_constant:.3g} s"
             if mode.oscillates:
-                rate, hertz = mode.frequency, mode.frequency / (2.0 * np.pi)
+                rate = mode.frequency
+                hertz = mode.frequency / (2.0 * np.pi)
                 label = f"{rate:.3g} rad/s, {hertz:.3g} Hz, damping {mode.damping_ratio:.2g}"
             labels.append(label)
         panel.set_xticks(range(half), names, rotation=90, fontsize=8)
@@ -155,7 +157,9 @@ def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> 
 
     For entries out of phase, draw also an outlined bar for the modulus.
     """
-    x, height = np.arange(len(shape)), -0.45  # the axis points down
+    # the axis points down
+    x = np.arange(len(shape))
+    height = -0.45
     axes.axhline(line, color="#888888", lw=0.5)
     axes.bar(x, height * shape.real, 0.7, line, color=colors)
     late = np.flatnonzero(np.abs(shape.imag) > 0.02 * np.abs(shape))
@@ -287,7 +291,8 @@ def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None 
             f"{name}: {min(loop.phase, 180.0):.0f} deg, {loop.gain[0]:.2g} to {loop.gain[1]:.3g}"
             for name, loop in zip(gain.input_names, loops, strict=True)
         )
-        lines, said = sizes.get_lines()[: len(loops)], "margins at each input: phase, gain factors"
+        lines = sizes.get_lines()[: len(loops)]
+        said = "margins at each input: phase, gain factors"
         letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
         figure.legend(lines, names, title=said, loc="outside right upper", fontsize=letters)
         # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
@@ -311,7 +316,10 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     # The loop gain of input i is T_ii / (1 - T_ii), with T = K (s I - A + B K)^-1 B. Here s is j w,
     # or e^(j w dt) for a sampled model.
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
-    F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
+    F = gain.closed_loop[np.ix_(fed, fed)]
+    B = gain.B[fed]
+    K = gain.K[:, fed]
+    dt = gain.dt
 
     def response(w: float) -> Values:
         s = np.exp(1j * w * dt) if dt else 1j * w
@@ -372,7 +380,8 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
 
 def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
     for index, (label, values) in enumerate(sets.items()):
-        color, marker = COLORS[index % len(COLORS)], "+" if index else "x"
+        color = COLORS[index % len(COLORS)]
+        marker = "+" if index else "x"
         axes.plot(values.real, values.imag, marker, color=color, label=label or None)
     if dt:
         angle = np.linspace(0.0, 2.0 * np.pi, 201)
@@ -394,7 +403,8 @@ def _poles_of(given: object) -> tuple[Values, float]:
     if hasattr(given, "poles"):
         return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
     refuse_masked("poles", given)
-    flat, poles = dimension("poles", given) == 1, np.asarray(given)
+    flat = dimension("poles", given) == 1
+    poles = np.asarray(given)
     if not (flat and poles.dtype.kind in "fiuc" and poles.size and np.isfinite(poles).all()):
         raise InputError(
             f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "

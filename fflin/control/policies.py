@@ -62,7 +62,8 @@ class Feedback:
 
     def deviation(self, robot: Robot) -> Deviation:
         """Return the function of t, q, v that returns the reference inputs u* and the error e."""
-        lin, state = self.lin, self.state_map(robot)
+        lin = self.lin
+        state = self.state_map(robot)
         S = selection(lin.state_names, state.names)
         near = S.T @ lin.x0
         return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
@@ -113,7 +114,8 @@ class StateFeedback(Feedback):
 
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin, S = self.lin, selection(self.lin.state_names, state.names)
+        lin = self.lin
+        S = selection(self.lin.state_names, state.names)
         return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
     def bind(self, robot: Robot) -> Policy:
@@ -299,7 +301,8 @@ class Loop:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
         self.rates: list[Array] = [self.estimate]
-        self.stages, self._last = 0, -np.inf
+        self.stages = 0
+        self._last = -np.inf
         self._at_rest: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba = Aba(state) if felt else None
@@ -315,7 +318,8 @@ class Loop:
                 "controller"
             )
         step, measure, near = self.at(t)
-        state, x = measure.state, measure.state.read(q, v, near=near)
+        state = measure.state
+        x = measure.state.read(q, v, near=near)
         noise: Array | float = 0.0
         if self._noise is not None:
             noise = vector("noise(t)", self._noise(t), self._ny, "one value for each output")
@@ -344,7 +348,8 @@ class Loop:
         if not self.dt and len(self.estimate):
             self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
             if last:
-                self.rates, self.stages = [self.estimate], 0
+                self.rates = [self.estimate]
+                self.stages = 0
 
 
 def decider(policy: object) -> object:

@@ -296,7 +296,8 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         InputError
             If the robot has other states, inputs or outputs than the trajectory.
         """
-        origin, home = self.trajectory.robot, self.state_map(robot)
+        origin = self.trajectory.robot
+        home = self.state_map(robot)
         made = f"the trajectory was made for '{origin.name}'"
         own = signals_of(StateMap(origin, frame="local"), "output")
         require_same(made, home, "output", *own)
@@ -306,13 +307,15 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
-        dt, sizes = self.filter.dt, self.filter.L.shape[1:]
+        dt = self.filter.dt
+        sizes = self.filter.L.shape[1:]
         return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *there(t)), self.noise)
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:
         """Model of the robot at rest after the trajectory, and gain of the steady-state filter."""
-        lin, seen = self.end.discretize(self.filter.dt), self.filter
+        lin = self.end.discretize(self.filter.dt)
+        seen = self.filter
         return lin, kalman(lin, seen.W[-1], seen.V).L
 
     def terms(self, t: float) -> Sample:

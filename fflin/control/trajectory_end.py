@@ -114,7 +114,9 @@ def _falling_end(traj: LinearTrajectory, end: int) -> SteadyEnd:
     """Return the robot at rest at a knot, relative to axes that fall with it (5.4)."""
     # Relative to axes that fall with the acceleration g, a robot moves as without gravity.
     robot = traj.robot.replace(gravity=(0.0, 0.0, 0.0))
-    q, v, data = traj.q[end], traj.v[end], robot.create_data()
+    q = traj.q[end]
+    v = traj.v[end]
+    data = robot.create_data()
     pin.centerOfMass(robot.model, data, q, v)
     fall = data.oMi[ROOT].rotation.T @ data.vcom[0]
     return SteadyEnd(_at_rest(robot, q, v), fall)

@@ -51,7 +51,9 @@ class Schedule(ModelDesign):
 
     def interval(self, t: float) -> int:
         """Return the index of the interval or sample at t; if there is none, raise `InputError`."""
-        t, first, last = number("t", t), self.starts[0], float(self.t[-1])
+        t = number("t", t)
+        first = self.starts[0]
+        last = float(self.t[-1])
         if not first <= t <= last:
             raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
         return bisect_right(self.starts, t) - 1
@@ -122,7 +124,8 @@ class GainSchedule(Schedule):
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that the gains were designed for."""
-        state, made = StateMap(robot), f"the gain schedule was made for '{self.robot}'"
+        state = StateMap(robot)
+        made = f"the gain schedule was made for '{self.robot}'"
         require_same(made, state, "state", self.state_names, None)
         require_same(made, state, "input", self.input_names, None)
         parts = self.knots, self.q, self.v, self.u
@@ -370,7 +373,9 @@ def tvlqr(
         if sample is not None:
             stages = list(held_stages(traj, dt, Q, R))
             gains, costs, residual = riccati.samples_back(reversed(stages), Qf)
-            t, P, K = traj.samples(dt), costs[::-1], np.concatenate((gains[::-1], gains[:1]))
+            t = traj.samples(dt)
+            P = costs[::-1]
+            K = np.concatenate((gains[::-1], gains[:1]))
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
         else:
             t, P = riccati.solve_back(at, traj.t, Qf)

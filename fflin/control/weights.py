@@ -118,7 +118,8 @@ def inverse_square(what: str, size: float) -> float:
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
     """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
-    size, rounding = len(names), 0.0
+    size = len(names)
+    rounding = 0.0
     if isinstance(value, Mapping):
         matrix = np.diag(_diagonal(what, value, names, complete=definite))
     elif (indices := dimension(what, value)) == 0:
@@ -127,7 +128,8 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
         hint = f": one weight for each of {names[0]} to {names[-1]}"
         matrix = np.diag(shaped(what, value, (size,), hint))
     else:
-        matrix, rounding = shaped(what, value, (size, size)), _ROUNDING
+        matrix = shaped(what, value, (size, size))
+        rounding = _ROUNDING
         skew = np.abs(matrix - matrix.T)
         if skew.max() > rounding * np.abs(matrix).max():
             i, j = np.unravel_index(int(skew.argmax()), skew.shape)
@@ -276,7 +278,8 @@ def rule_weights(
     # If a sampled model has a known continuous model, the rule gives a cost for the continuous
     # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
     # the robot names a rule, the rule is "urdf".
-    source, given = lin.generator or lin, given if isinstance(given, Mapping) else {"rule": given}
+    source = lin.generator or lin
+    given = given if isinstance(given, Mapping) else {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
     own = lin.weights if given.get("rule") is None else {}
     name = own.get("rule", given.get("rule"))
@@ -285,7 +288,9 @@ def rule_weights(
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
-        Q, R, rule = np.eye(nx), np.eye(nu), "1 for every state and every input (identity)"
+        Q = np.eye(nx)
+        R = np.eye(nu)
+        rule = "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
     if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
@@ -298,7 +303,9 @@ def rule_weights(
         Q, R = scale * Q, scale * R
         for index, (value, *_) in weights.items():
             matrix, at = (Q, index) if index < len(Q) else (R, index - len(Q))
-            matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, value
+            matrix[at] = 0.0
+            matrix[:, at] = 0.0
+            matrix[at, at] = value
         named = dict.fromkeys(key for _, key, _ in weights.values())
         rule = f"{', '.join(named)} as given; all other weights: {rule}"
         rule += " (these figures are for this rule alone)" if terms.any() else ""
@@ -329,7 +336,8 @@ def _of_regulated(
     wheels, _ = ignorable_wheels(lin)
     body = lin if part is lin else regulated_part(without(lin, wheels))
     at = _limited_wheels(lin, wheels)
-    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    names = [lin.state_names[i + len(lin.M)] for i in at]
+    spin = np.abs(lin.x0[at + len(lin.M)])
     most = np.array([lin.limits[name] for name in names])
     # For a wheel that is already at its speed limit, `room` is computed as for a wheel at rest. The
     # report names the wheel.
@@ -345,7 +353,8 @@ def _of_regulated(
     Q = S.T @ Q @ S
     terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S, slow = selection(speeds, lin.state_names), _SPEEDS * bandwidth
+        S = selection(speeds, lin.state_names)
+        slow = _SPEEDS * bandwidth
         # The combinations of inputs in the null space of `forces` accelerate the wheels, but exert
         # no force on the robot without its wheels. X maps coordinates in this null space to the
         # accelerations of the wheels.
@@ -361,15 +370,18 @@ def _weights_of(
     lin: LinearModel, given: Mapping[str, object], *, of_robot: bool = False
 ) -> dict[int, _Given]:
     """Return {index: given weight}. The indices of the inputs follow the indices of the states."""
-    states, inputs = lin.state_names, input_keys(lin)
-    found, every = dict[int, _Given](), (*states, *inputs)
+    states = lin.state_names
+    inputs = input_keys(lin)
+    found = dict[int, _Given]()
+    every = (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
     for part, kind, known in kinds:
         values = dict[str, _Given]()
         for key, value in numbers(part, given.get(part, {}), "name", f"{part} of").items():
             if of_robot and not stands_for_any(key, known):
                 continue  # a reduced model may lack states that the robot's weights name
-            what, largest = f"largest value of '{key}' (--bryson)", part == "bryson"
+            what = f"largest value of '{key}' (--bryson)"
+            largest = part == "bryson"
             if largest and key.startswith("q_b"):
                 require_chart(what, value)
             values[key] = inverse_square(what, value) if largest else value, key, largest

@@ -60,7 +60,8 @@ class Aba:
         forces = u @ self.actuation.fixed.T
         if self._resists:
             forces += self._passive_force(q, v)
-        tau, found = state.lift(forces.T).T, np.empty_like(v)
+        tau = state.lift(forces.T).T
+        found = np.empty_like(v)
         for k, point in enumerate(zip(q, v, tau, strict=True)):
             wrenches = self.actuation.wrenches(u[k]) or self._none
             found[k] = pin.aba(self._model, self._data, *point, wrenches)
@@ -90,7 +91,8 @@ class Aba:
         # that unit inputs cause at rest without gravity.
         state = self.state
         stiffness, damping, _ = state.robot.springs
-        tau, field = state.lift(self.actuation.fixed @ u + self._passive_force(q, v)), self.field
+        tau = state.lift(self.actuation.fixed @ u + self._passive_force(q, v))
+        field = self.field
         here = q, v
         if field:
             q, v = field.near(q, v)
@@ -129,7 +131,8 @@ class Aba:
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return the wrench on each link from inputs, gyroscopic torques and gravity gradient."""
-        stored, wrenches = self.state.robot.stored_momentum, self.actuation.wrenches(u)
+        stored = self.state.robot.stored_momentum
+        wrenches = self.actuation.wrenches(u)
         wrenches = wrenches or self._none
         if not (stored or self.field):
             return wrenches

@@ -96,7 +96,8 @@ def state_units(robot: Robot) -> dict[str, str]:
     q_m, qdot_m = dict[str, str](), dict[str, str]()
     for joint in robot.joints:
         unit = joint.unit
-        q_m[f"q_m.{joint.name}"], qdot_m[f"qdot_m.{joint.name}"] = unit, f"{unit}/s"
+        q_m[f"q_m.{joint.name}"] = unit
+        qdot_m[f"qdot_m.{joint.name}"] = f"{unit}/s"
     return _POSE | q_m | _TWIST | qdot_m
 
 
@@ -252,21 +253,26 @@ def readout(
     robot, g = state.robot, state.groups
     idx_q = np.array([*map(attrgetter("idx_q"), robot.joints)], dtype=np.intp)
     scales = np.array([*map(attrgetter("scale"), robot.joints)])
-    circling, cos = state.unbounded, idx_q[state.unbounded]
+    circling = state.unbounded
+    cos = idx_q[state.unbounded]
     middle = near[g.q_m][circling]
     # x = S z, where z stacks q, v, the angles of continuous joints, omega_b and v_b in world axes,
     # and 1.
     ends = np.cumsum((robot.nq, robot.nv, len(circling), 3, 3))
     S = np.zeros((state.nx, ends[-1] + 1))
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(S, ends, axis=1)
-    at, turn = state.origin, turning.product_matrix(state.origin_quaternion)
-    of_q[g.q_b, 3:7], of_q[g.r_b, :3], constant[g.r_b, 0] = turn[:3], at.rotation, at.translation
+    at = state.origin
+    turn = turning.product_matrix(state.origin_quaternion)
+    of_q[g.q_b, 3:7] = turn[:3]
+    of_q[g.r_b, :3] = at.rotation
+    constant[g.r_b, 0] = at.translation
     of_q[g.q_m][np.arange(robot.n), idx_q] = 1.0 / scales
     of_q[:, cos] = 0.0
     of_angles[6 + circling] = np.eye(len(circling))
     of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
     for group, of_part in compress(((g.omega_b, of_angular), (g.v_b, of_linear)), state.axes):
-        of_v[group], of_part[group] = 0.0, at.rotation
+        of_v[group] = 0.0
+        of_part[group] = at.rotation
     gains = -K @ S
     gains[:, -1] += offset
 

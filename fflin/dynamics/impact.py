@@ -160,12 +160,16 @@ def struck(
     M (v_before - v_after) in Pinocchio's order, which is minus the generalised impulse on the part.
     In `whole`, the joint names of the second part begin with `prefix`.
     """
-    state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
+    state = StateMap(whole)
+    q = whole.neutral()
+    local = pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
-    q[:7], at = parts[0][1][:7], 0
+    q[:7] = parts[0][1][:7]
+    at = 0
     for robot, own_q, _ in parts:
-        rows, start = G[at : at + robot.nv], f"{prefix}." if at else ""
+        rows = G[at : at + robot.nv]
+        start = f"{prefix}." if at else ""
         M[at : at + robot.nv, at : at + robot.nv] = inertia_at(robot, own_q)
         for name in list(robot.model.names)[ROOT + 1 :]:
             if whole.model.existJointName(start + name):
@@ -179,7 +183,8 @@ def struck(
             rows[:6] = pin.computeFrameJacobian(whole.model, data, q, frame, local)
         at += robot.nv
     spread = np.eye(whole.nv) if state.S is None else state.S
-    G, before = G @ spread, np.concatenate([own_v for *_, own_v in parts])
+    G = G @ spread
+    before = np.concatenate([own_v for *_, own_v in parts])
     nu = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
     jump, v = before - G @ nu, spread @ nu
     return Impact(
@@ -204,7 +209,8 @@ def momentum_of(robot: Robot, q: Array, v: Array) -> Array:
     """Return the momentum (6,) in world axes: linear, then angular about the world's origin."""
     data = robot.create_data()
     pin.computeCentroidalMomentum(robot.model, data, q, v)
-    linear, angular = data.hg.linear, data.hg.angular + np.cross(data.com[0], data.hg.linear)
+    linear = data.hg.linear
+    angular = data.hg.angular + np.cross(data.com[0], data.hg.linear)
     return np.concatenate((linear, angular))
 
 

@@ -136,7 +136,8 @@ def integrals(robot: Robot, q: Array, v: Array) -> Integrals:
 @lru_cache(maxsize=16)  # robots do not change
 def _bodies(robot: Robot) -> list[_Body]:
     """Return the bodies of a robot, in Pinocchio's order."""
-    model, stored = robot.model, np.zeros((robot.model.njoints, 3))
+    model = robot.model
+    stored = np.zeros((robot.model.njoints, 3))
     for index, momentum in robot.stored_momentum:
         stored[index] += momentum
     frames = [pin.SE3.Identity()] * model.njoints
@@ -220,7 +221,8 @@ def _moved(above: _Motion, body: _Body, q: Array, v: Array) -> _Motion:
     angular = above.angular
     if screw is None:
         local = _joint_motion(joint, q, v)
-        axes, shift = (x, y, z), _plus(shift, _turned((x, y, z), local.origin))
+        axes = (x, y, z)
+        shift = _plus(shift, _turned((x, y, z), local.origin))
         linear = _plus(above.linear, _cross(angular, shift))
         linear = _plus(linear, _turned(axes, local.linear))
         angular = _plus(angular, _turned(axes, local.angular))
@@ -248,7 +250,8 @@ def _moved(above: _Motion, body: _Body, q: Array, v: Array) -> _Motion:
 
 def _joint_motion(joint: pin.JointModel, q: Array, v: Array) -> _Motion:
     """Return the motion of a joint that is not a screw, in the axes of its frame at position 0."""
-    count, data = q.shape[1], joint.createData()
+    count = q.shape[1]
+    data = joint.createData()
     rotation, vectors = np.empty((3, 3, count)), np.empty((3, 3, count))
     for i in range(count):
         joint.calc(data, q[:, i].copy(), v[:, i].copy())

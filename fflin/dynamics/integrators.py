@@ -78,7 +78,9 @@ class Integrator(ABC):
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later; `f(t, q, v)` returns the acceleration."""
-        model, stages, begins = self.model, self._stages, list[Array]()
+        model = self.model
+        stages = self._stages
+        begins = list[Array]()
         integrate = self._integrate
         stages[..., 0, :] = v
         for k, node in enumerate(self.nodes, start=1):
@@ -169,7 +171,8 @@ def integrated_hold(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
     For a linear system, CF4 is the classical Runge-Kutta method: its matrices are Taylor
     polynomials.
     """
-    one, Z = np.eye(len(A)), A * h
+    one = np.eye(len(A))
+    Z = A * h
     mean = one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0))
     return one + Z @ mean, h * mean @ driven
 
@@ -235,7 +238,9 @@ def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     doublings = max(math.ceil(halvings), 0)
     block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
     size = weight / rate
-    block[..., :n, :n], block[..., :n, n:], block[..., n:, n:] = -F.mT, W / size, F
+    block[..., :n, :n] = -F.mT
+    block[..., :n, n:] = W / size
+    block[..., n:, n:] = F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * np.ldexp(h, -doublings))
         step = exponential[..., n:, n:]

@@ -49,7 +49,8 @@ class OrbitField:
         n = mean_motion(robot)
         bodies = robot.model.inertias.tolist()[ROOT:]
         self.robot = robot
-        self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum
+        self._root = robot.model.jointPlacements[ROOT]
+        self._stored = robot.stored_momentum
         self.rate: Array = n * z
         self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
         self.axes: Array = np.column_stack((r, np.cross(z, r), z))
@@ -102,7 +103,9 @@ class OrbitField:
 
         `absolute` (nv,) is the inertial velocity, and `rate` (nv,) is its time derivative.
         """
-        frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
+        frame = absolute - v
+        own = skew(v[PIN_ANGULAR])
+        found = rate.copy()
         found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
         found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
         return found
@@ -132,16 +135,19 @@ class OrbitField:
         # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body, in its
         # own axes, changes T by T [t]x - [t]x T.
         model, (R, centers) = self.robot.model, self._bodies(data)
-        joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
+        joints = range(ROOT, model.njoints)
+        local = pin.ReferenceFrame.LOCAL
         J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
         moved = J.copy()
         moved[:, :, PIN_LINEAR] = 0.0
         linear, turned = moved[:, PIN_LINEAR], moved[:, PIN_ANGULAR]
-        T, center = R.mT @ self.tide @ R, skew((R.mT @ centers)[..., 0])
+        T = R.mT @ self.tide @ R
+        center = skew((R.mT @ centers)[..., 0])
         shift = linear + (center - self._levers) @ turned
         pull = skew((R.mT @ self.tide @ centers)[..., 0])
         force = self._mass[..., None] * (T @ shift + (pull - T @ center) @ turned)
-        units, T = skew(np.eye(3)), T[:, None]
+        units = skew(np.eye(3))
+        T = T[:, None]
         turn = self._inertia[:, None] @ (T @ units - units @ T)
         turn -= turn.mT
         torque = turn[..., (2, 0, 1), (1, 2, 0)].mT @ turned + self._levers @ force

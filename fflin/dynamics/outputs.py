@@ -90,7 +90,8 @@ def _momentum_derivatives(at: Point, to: Sensed) -> None:
     # The last argument is an acceleration. It affects only the derivatives of dh/dt, which are not
     # used here, so v is given in its place.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
-    mass, h = pin.computeTotalMass(at.model), at.data.hg
+    mass = pin.computeTotalMass(at.model)
+    h = at.data.hg
     to.y[:3] = at.R.dot(h.angular)
     to.y[3:] = at.R.dot(h.linear + mass * at.v_b)
     for part, rows in (slice(0, 3), PIN_ANGULAR), (slice(3, 6), PIN_LINEAR):
@@ -105,7 +106,8 @@ def _momentum_derivatives(at: Point, to: Sensed) -> None:
 
 
 def _momentum(world: Measuring, _: object) -> Array:
-    h, turned = pin.computeCentroidalMomentum(world.model, world.data), world.reference.rotation.T
+    h = pin.computeCentroidalMomentum(world.model, world.data)
+    turned = world.reference.rotation.T
     angular = h.angular.copy()
     for joint, stored in world.stored:
         angular += world.data.oMi[joint].rotation @ stored
@@ -116,10 +118,12 @@ def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) ->
     # The output is the pose of `frame` relative to the frame `other`, or relative to the reference
     # if there is no other frame.
     origin = at.placement(*other).inverse() if other else pin.SE3(at.R, at.r_b)
-    relative, jacobian = origin * at.placement(frame), at.jacobian(frame)
+    relative = origin * at.placement(frame)
+    jacobian = at.jacobian(frame)
     R, p = relative.rotation, relative.translation
     to.y[:3] = p
-    to.by_q[:3], to.by_q[3:] = R.dot(jacobian[PIN_LINEAR]), jacobian[PIN_ANGULAR]
+    to.by_q[:3] = R.dot(jacobian[PIN_LINEAR])
+    to.by_q[3:] = jacobian[PIN_ANGULAR]
     if other:
         jacobian = at.jacobian(*other)
         to.by_q[:3] += skew(p).dot(jacobian[PIN_ANGULAR]) - jacobian[PIN_LINEAR]
@@ -276,7 +280,8 @@ class Sensing:
             return sensed
         state, robot = self.state, self.state.robot
         centred_q, centred_v = q.copy(), v.copy()
-        centred_q[:7], centred_v[PIN_LINEAR] = self._home, 0.0
+        centred_q[:7] = self._home
+        centred_v[PIN_LINEAR] = 0.0
         R, r_b = _STANDING
         if not self._own_reference:
             R, r_b = state.rotation(q), state.positions(q)
@@ -311,9 +316,13 @@ class Measuring:
     """
 
     def __init__(self, state: StateMap, q: Array) -> None:
-        self.state, robot, field = state, state.robot, state.field
-        self.model, self.data = robot.model, robot.create_data()
-        self.reference, self.gravity = state.reference, np.array(robot.gravity)
+        self.state = state
+        robot = state.robot
+        field = state.field
+        self.model = robot.model
+        self.data = robot.create_data()
+        self.reference = state.reference
+        self.gravity = np.array(robot.gravity)
         self.stored = robot.stored_momentum  # as in `Point`
         # Angular velocity (3,) of the orbital frame in its own axes; zero without an orbit.
         self.spin = np.zeros(3) if field is None else field.rate

@@ -47,7 +47,9 @@ class Inertia:
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         robot = state.robot
-        self._state, self._model, self._data = state, robot.model, data
+        self._state = state
+        self._model = robot.model
+        self._data = data
         # These are views of the array `data.Minv`, which Pinocchio overwrites in place.
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
@@ -110,7 +112,8 @@ class Inertia:
 
         The message names the coordinates whose motion has almost no inertia.
         """
-        name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
+        name = self._state.robot.name
+        scale = np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # true for NaN as well
         mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
@@ -217,7 +220,8 @@ class Accelerations:
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
-        self._model, self._nv = robot.model, 6 + robot.n
+        self._model = robot.model
+        self._nv = 6 + robot.n
         self.inertia = Inertia(state, data)
         self._springs = robot.springs
         self._resists = bool(np.any(robot.springs))
@@ -253,7 +257,8 @@ class Accelerations:
         # the pose and linear velocity of the base. In orbit, c depends on the attitude only through
         # `tide`. Gravity is zero as well, because uniform gravity accelerates all parts of the
         # robot alike (equivalence principle).
-        q_still, v_still = self.inertia.centred(q), self._still
+        q_still = self.inertia.centred(q)
+        v_still = self._still
         v_still[3:] = v[3:]
         if tide:
             v_still[PIN_ANGULAR] += tide.spin
@@ -315,7 +320,9 @@ class Accelerations:
         The derivatives with respect to q exclude the change of the Jacobian, because the
         derivatives of RNEA with these wrenches already include it.
         """
-        model, data, nv = self._model, self._data, len(v)
+        model = self._model
+        data = self._data
+        nv = len(v)
         # With the angular Jacobian J of a link in the axes of the link, the torque h x omega has
         # the generalised force J^T [h]x J v (6.3).
         if wrenches is None:

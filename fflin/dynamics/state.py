@@ -94,7 +94,8 @@ class StateMap:
     ) -> None:
         instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         robot.require_unchanged()
-        n, self.robot = robot.n, robot
+        n = robot.n
+        self.robot = robot
         self.frame = names.frame_of(robot, frame)
         self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
@@ -397,8 +398,10 @@ class Actuation:
     """Inputs of a robot: their names and units, the matrix B_u, and their wrenches on the links."""
 
     def __init__(self, state: StateMap) -> None:
-        robot, nv = state.robot, 6 + state.robot.n
-        self.state, self._model = state, robot.model
+        robot = state.robot
+        nv = 6 + state.robot.n
+        self.state = state
+        self._model = robot.model
         names: list[str] = []
         units: list[str] = []
         # {group: indices of its inputs}. The groups are tau_b, F_b, tau_m, thrust and wheel. They
@@ -412,7 +415,8 @@ class Actuation:
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in robot.named_inputs:
-            at, unit = len(columns), item.UNIT
+            at = len(columns)
+            unit = item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
                 rows = ANGULAR if isinstance(item, kinds.BaseTorque) else LINEAR
                 columns += list(identity[rows])

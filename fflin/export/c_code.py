@@ -270,7 +270,8 @@ class CLaw:
             q, v = map(np.array, self._about["point"])
             there, sizes = (Measuring(state, q), state.read(q, v)), (self._about["memory"], 0)
             return Loop(state, self.dt, sizes, lambda t: (partial(self._output_step, t), *there))
-        world, n = StateMap(robot, frame=state.frame), robot.n
+        world = StateMap(robot, frame=state.frame)
+        n = robot.n
         # C has no empty arrays. So the C arrays for the joints have one entry if there is no joint.
         room = max(n, 1)
         given, u = (np.zeros(size, self._real) for size in (13 + 2 * room, len(self._about["u0"])))
@@ -336,7 +337,8 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     """Return the title of a law, and the texts of its four files as {file ending: text}."""
     state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
     names, units = law.inputs
-    kind, title = "state" if state else "output", f"{law.title} of '{robot.name}'"
+    kind = "state" if state else "output"
+    title = f"{law.title} of '{robot.name}'"
     frame = state.frame if state else lin.frame if lin else ""
     # Largest rounding error that the test program accepts, relative to `Case.scale`, the sum of the
     # magnitudes of the terms. In single precision, the error is the unit roundoff 2^-24 times the
@@ -397,7 +399,9 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
     """Return {placeholder: text} for placeholders that occur only in templates of state laws."""
-    n, rows, points = state.robot.n, len(law.tables["u0"]), law.tables.get("axis_points")
+    n = state.robot.n
+    rows = len(law.tables["u0"])
+    points = law.tables.get("axis_points")
     words: dict[str, object] = {
         **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
         **{"rows": rows, "gains": len(law.tables["K"])},

@@ -114,17 +114,21 @@ def law_of(given: object, robot: object, limits: object) -> Law:
 
 
 def _state_law(given: OfStates, robot: Robot) -> Law:
-    lin, axes, title = None, dict[str, Array](), type(given).__name__
+    lin = None
+    axes = dict[str, Array]()
+    title = type(given).__name__
     if isinstance(given, GainSchedule):
         given = TrajectoryFeedback(given.trajectory(robot), given)
     if isinstance(given, TrajectoryFeedback):
-        dt, state = given.schedule.dt, given.state_map(robot)
+        dt = given.schedule.dt
+        state = given.state_map(robot)
         tables = _samples(given, state)
     else:
         if isinstance(given, Gain):
             made = f"the gain was designed for '{given.robot}'"
             own = given._lin or model_of(given, robot, made, pin.XYZQUATToSE3(given.placement))
-            dt, given = given.dt, StateFeedback(own, given.K)
+            dt = given.dt
+            given = StateFeedback(own, given.K)
         else:
             dt = given.lin.dt
         lin = given.lin
@@ -165,7 +169,9 @@ def _state_cases(
     Some states are close to half a turn from the reference or the target. If K is interpolated,
     some states are at the ends of the grid or beyond.
     """
-    random, n, turning = np.random.default_rng(0), state.robot.n, state.unbounded
+    random = np.random.default_rng(0)
+    n = state.robot.n
+    turning = state.unbounded
     world = StateMap(state.robot, frame=state.frame)
     for index in range(CASES):
         row = index % len(tables["x0"])
@@ -229,7 +235,8 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
 
 def _output_law(given: OfOutputs, robot: Robot) -> Law:
     if isinstance(given, LinearController):
-        terms, lin = given.terms(), given.lin
+        terms = given.terms()
+        lin = given.lin
         inputs, signals = (lin.input_names, lin.input_units), (lin.output_names, lin.output_units)
     else:
         none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
@@ -278,7 +285,8 @@ def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
             return y
 
         u, next_z = by.step(z, measured)
-        of_z, of_y = np.abs(z), np.abs(y) + np.abs(by.y0) + np.abs(turns)
+        of_z = np.abs(z)
+        of_y = np.abs(y) + np.abs(by.y0) + np.abs(turns)
         scale = np.abs(by.u0) + np.abs(by.C) @ of_z + np.abs(by.D) @ of_y
         after = np.abs(by.A) @ of_z + np.abs(by.B) @ of_y
         yield Case(0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after))

@@ -174,7 +174,9 @@ def allocate(allocation, point, commanded):
         return
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
     own, tree, problem = allocation.point, asking.tree, allocation.problem
-    size, count, columns = len(tree.row), len(problem.least), problem.columns
+    size = len(tree.row)
+    count = len(problem.least)
+    columns = problem.columns
     vec.copy(point.q, 0, own.q, 0, len(own.q))
     configure(work, asking, own.q)
     factorise(work, tree)
@@ -191,7 +193,8 @@ def allocate(allocation, point, commanded):
     for column in range(count + 1):
         solve_inwards(work, tree, columns, column * size)
         for k in range(size):
-            pivot, at = load(work, tree.scaled + tree.row[k] + tree.depth[k]), column * size + k
+            pivot = load(work, tree.scaled + tree.row[k] + tree.depth[k])
+            at = column * size + k
             store(columns, at, load(columns, at) * root(pivot))
     for lane in range(vec.lane_count(point.u)):
         solve(problem, size, lane)
@@ -214,7 +217,9 @@ def _write_force(work, robot, point, columns, at):
 def solve(problem, size, lane):
     """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
     x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
-    least, most, count = problem.least, problem.most, len(problem.least)
+    least = problem.least
+    most = problem.most
+    count = len(problem.least)
     write_scaled(problem.columns, lane, 1.0, A)
     last = count * size
     unit = root(row_product(A, 0, A, 0, last))
@@ -225,7 +230,8 @@ def solve(problem, size, lane):
     scale = 1.0 if nothing else unit / force
     free = 0
     for j in range(count):
-        low[j], high[j] = least[j] * scale, max(most[j] * scale, least[j] * scale + 1e-15)
+        low[j] = least[j] * scale
+        high[j] = max(most[j] * scale, least[j] * scale + 1e-15)
         x[j] = min(max(0.0, low[j]), high[j])
         problem.state[j] = _LOW
         if least[j] != 0.0:
@@ -257,10 +263,15 @@ def _solve_scaled(problem, size, free, kept):
     `kept` of these inputs. Return `free` and `kept` for the next call.
     """
     x, s, low, high = problem.x, problem.s, problem.low, problem.high
-    state, order, count, newest = problem.state, problem.order, len(problem.x), -1
+    state = problem.state
+    order = problem.order
+    count = len(problem.x)
+    newest = -1
     for _ in range(20 * count):
         _fit(problem, size, free, kept)
-        kept, hit, step = free, -1, 1.0
+        kept = free
+        hit = -1
+        step = 1.0
         for at in range(free):
             j = order[at]
             if not low[j] <= s[j] <= high[j]:
@@ -274,7 +285,8 @@ def _solve_scaled(problem, size, free, kept):
             j = order[hit]
             x[j] = low[j] if s[j] < low[j] else high[j]
             state[j] = _LOW if s[j] < low[j] else _HIGH
-            free, kept = free - 1, hit
+            free = free - 1
+            kept = hit
             for at in range(hit, free):
                 order[at] = order[at + 1]
             if j != newest or step > 0.0:
@@ -306,7 +318,9 @@ def _fit(problem, size, free, kept):
     First, the QR factors are extended by the columns of the free inputs from `order[kept]` on.
     """
     s, x, Q, R, b, y = problem.s, problem.x, problem.Q, problem.R, problem.b, problem.y
-    order, A, count = problem.order, problem.A, len(problem.s)
+    order = problem.order
+    A = problem.A
+    count = len(problem.s)
     rows = size + count
     # Write the right-hand side to b: `wanted` minus the force of all inputs that are at their
     # bounds, and then -LEAST times each of these inputs.
@@ -342,7 +356,11 @@ def _steepest(problem, size):
     Inputs that were tried and could not leave their bounds are excluded. If no release reduces the
     cost, return -1.
     """
-    best, found, b, state, slopes = 0.0, -1, problem.b, problem.state, problem.y
+    best = 0.0
+    found = -1
+    b = problem.b
+    state = problem.state
+    slopes = problem.y
     row_products(problem.A[: len(state) * size], size, b, slopes)
     for j in range(len(state)):
         if state[j] == _LOW or state[j] == _HIGH:
@@ -359,7 +377,8 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
 
     If several u are equally good, the u with the smallest norm is returned.
     """
-    numbers, size = [0.0] * len(least), len(b)
+    numbers = [0.0] * len(least)
+    size = len(b)
     # Reading an entry is faster for lists than for arrays, so lists replace the arrays that are
     # read entry by entry.
     problem = least_squares(least.tolist(), most.tolist(), size)._replace(

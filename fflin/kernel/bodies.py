@@ -65,7 +65,8 @@ def outwards(work, tree, q):
         at = places + body * PLACE
         value = load(q, tree.index[body])
         if tree.unbounded[body]:
-            cosine, sine = value, load(q, tree.index[body] + 1)
+            cosine = value
+            sine = load(q, tree.index[body] + 1)
         elif tree.turns[body] != 0.0:
             cosine, sine = vec.cosine_and_sine(tree.turns[body] * value)
         else:
@@ -143,7 +144,8 @@ def factorise(work, tree):
     """
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
-        row, depth = packed + tree.row[k], tree.depth[k]
+        row = packed + tree.row[k]
+        depth = tree.depth[k]
         inverse = 1.0 / load(work, row + depth)
         store(work, scaled + (tree.row[k] + depth), inverse)
         store(work, row + depth, 1.0)
@@ -162,7 +164,8 @@ def solve_inwards(work, tree, x, first):
     L is the factor of M, which `factorise` must have written.
     """
     for k in range(len(tree.row) - 1, -1, -1):
-        value, row = load(x, first + k), tree.row[k]
+        value = load(x, first + k)
+        row = tree.row[k]
         for t in range(tree.depth[k]):
             at = first + tree.path[row + t]
             store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
@@ -187,7 +190,8 @@ def invert_factor(work, tree):
     """Replace the factor L of `factorise` by U = L^-1, and write V = L^-1 D^-1 at `scaled`."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row)):
-        row, depth = packed + tree.row[k], tree.depth[k]
+        row = packed + tree.row[k]
+        depth = tree.depth[k]
         for t in range(depth):
             total = -load(work, row + t)
             for s in range(t + 1, depth):
@@ -205,7 +209,8 @@ def multiply(work, tree, judged):
     `invert_factor` must have written U = L^-1 and V = L^-1 D^-1.
     """
     packed, scaled, square = tree.packed, tree.scaled, tree.square
-    size, coupling = len(tree.row), 0.0
+    size = len(tree.row)
+    coupling = 0.0
     for i in range(size):
         left = packed + tree.row[i]
         for j in range(i + 1):
@@ -359,7 +364,8 @@ def write_columns(work, tree):
     count = len(tree.wrench_body)
     vec.clear(work, tree.columns, len(tree.row) * count)
     for index in range(count):
-        body, wrench = tree.wrench_body[index], carried_wrench(work, tree, index)
+        body = tree.wrench_body[index]
+        wrench = carried_wrench(work, tree, index)
         while body > 0:
             value = vec.dot6(joint_axis(work, tree, body), wrench)
             vec.add(work, tree.columns + tree.coordinate[body] * count + index, value)

@@ -207,7 +207,8 @@ def _between_processes(path: Path) -> ExitStack:
 
 def is_kept(module: str, name: str) -> bool:
     """Return whether the disk has machine code of a function, compiled from the current sources."""
-    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    own = Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_stored(folder, module, name)[0] for folder in folders)
 

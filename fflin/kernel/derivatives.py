@@ -66,6 +66,16 @@ def _coriolis_transposed(work, at, along):
     return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
+def _write_springs(work, tree, width):
+    """Write the derivatives of the forces of springs and dampers; all other entries are zero."""
+    n = len(tree.row) - 6
+    vec.clear(work, tree.lower, len(tree.row) * width)
+    for index in range(n):
+        row = tree.lower + (6 + index) * width
+        store(work, row + (6 + index), load(tree.stiffness, index))
+        store(work, row + (12 + n + index), load(tree.damping, index))
+
+
 def differentiate(work, tree):
     """Write the derivatives of M c + b - B_u u - f at constant c.
 
@@ -73,13 +83,12 @@ def differentiate(work, tree):
     (6 + n, 12 + 2 n). Each column is the derivative with respect to one coordinate of a
     displacement of the state, in base axes.
     """
-    n, width, zero, one = len(tree.row) - 6, 2 * len(tree.row), 0.0, 1.0
+    n = len(tree.row) - 6
+    width = 2 * len(tree.row)
+    zero = 0.0
+    one = 1.0
     spin = vec.get3(work, tree.motion)
-    vec.clear(work, tree.lower, len(tree.row) * width)
-    for index in range(n):
-        row = tree.lower + (6 + index) * width
-        store(work, row + (6 + index), load(tree.stiffness, index))
-        store(work, row + (12 + n + index), load(tree.damping, index))
+    _write_springs(work, tree, width)
     # The path of a joint i is the base, the joints before joint i, and joint i itself. For each
     # joint i, write the derivatives of the forces of its path with respect to the position and rate
     # of joint i. Also write the derivatives of the force of joint i with respect to the positions
@@ -155,7 +164,8 @@ def _solve(work, tree, slopes):
 
     Six columns are computed at a time.
     """
-    size, width = len(tree.row), 2 * len(tree.row)
+    size = len(tree.row)
+    width = 2 * len(tree.row)
     none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     # The first six columns are for the base's rotation and translation. These columns are zero,
     # because the kernel supports no orbits.
@@ -207,7 +217,8 @@ def derive(tree, points, out, lanes, work):
     q, nu, force, u = points
     c, A, by_u, judged = out
     size = len(tree.row)
-    slopes, moves = tree.size, len(nu) > 0
+    slopes = tree.size
+    moves = len(nu) > 0
     inputs = slopes + size * 2 * size
     coupling = inputs + size * len(tree.driven)
     for block in range(0, len(q), LANES):
@@ -264,7 +275,8 @@ class RowAccelerations:
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
-        nv, nu = state.nx // 2, len(actuation.names)
+        nv = state.nx // 2
+        nu = len(actuation.names)
         self.state, self._actuation, self._tree = state, actuation, tree
         self._sizes = state.robot.nq, nv, nv, nu
         self._work = tree.size + nv * state.nx + nv * nu + 1

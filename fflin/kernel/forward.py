@@ -108,7 +108,8 @@ def apply_faults(
         fraction = chosen(left, 1.0, left, 1.0)
         store(given, index, chosen(0.0, left, fraction * value, 0.0))
     for index in range(len(triads)):
-        at, columns = triads[index], vec.get_columns(faults.turn, 9 * index)
+        at = triads[index]
+        columns = vec.get_columns(faults.turn, 9 * index)
         vec.put3(given, at, vec.product(columns, vec.get3(given, at)))
 
 
@@ -119,7 +120,8 @@ def turn_held(robot, point):
     """
     pushing = point.pushing
     for index in range(len(robot.held)):
-        at, turn = robot.held[index], vec.attitude(robot.origin)
+        at = robot.held[index]
+        turn = vec.attitude(robot.origin)
         axes = vec.columns_of(vec.quaternion_times(turn, vec.attitude(point.q)))
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
@@ -148,7 +150,8 @@ def accelerate(work, robot, point, rates, to):
     `configure` must be called before this function. The factorisation of M overwrites M.
     """
     tree, nu = robot.tree, point.nu
-    force, size = tree.c, len(tree.row)
+    force = tree.c
+    size = len(tree.row)
     bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
     vec.copy(work, force, point.wrench, 0, 6)
@@ -246,7 +249,8 @@ def start_at(work, robot, reference, point):
     `point` is the initial point. `configure` must be called before this function. The last three
     entries of `reference.start`, the point of reference, must already be set.
     """
-    axes, tree = vec.axes_of(point.q), robot.tree
+    axes = vec.axes_of(point.q)
+    tree = robot.tree
     lever = vec.get3(work, tree.inertias + 1)
     nothing = vec.minus(lever, lever)
     angular, linear = _momentum_error(work, robot, point.nu, (nothing, nothing))

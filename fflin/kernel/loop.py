@@ -142,7 +142,9 @@ def _begin_pulses(channel, step, u):
 
     Lanes in which `fresh` is 0 do not change.
     """
-    pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
+    pulses = channel.pulses
+    sample = channel.sample
+    fresh = load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
         command = load(u, pulses.at[index])
@@ -285,7 +287,10 @@ def advance(words, clock, last, every, rows, work):
     """
     of = ARGUMENTS(words)
     robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
-    point, h, at = of.point, method.h, 0  # `at` is the index of the next entry in `rows`
+    # `at` is the index of the next entry in `rows`
+    point = of.point
+    h = method.h
+    at = 0
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
@@ -388,7 +393,8 @@ def _compare(stats, step):
             store(e, index, load(stats.law.x, index) - load(stats.x_ref, index))
     vec.clear(sizes, 0, len(sizes))
     for index in range(len(e)):
-        value, kind = _size(load(e, index)), stats.kind[index]
+        value = _size(load(e, index))
+        kind = stats.kind[index]
         if kind >= 0:
             _grow(stats.largest_x, index, value)
         if kind > 0:
@@ -405,8 +411,12 @@ def take(words, rows, first, count):
     `first` is the index of the first step. `words` are the 64-bit words of `RunStatistics`.
     """
     stats = RUN_STATISTICS(words)
-    at, sizes, kept = stats.at, stats.sizes, 0
-    width, inputs, e = len(at.q) + len(at.nu), len(stats.largest_u), stats.path.e
+    at = stats.at
+    sizes = stats.sizes
+    kept = 0
+    width = len(at.q) + len(at.nu)
+    inputs = len(stats.largest_u)
+    e = stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):

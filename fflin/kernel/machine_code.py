@@ -317,7 +317,8 @@ class _Fields(AttributeTemplate):
 def _field(
     context: BaseContext, builder: ir.IRBuilder, kind: _StructType, words: ir.Value, name: str
 ) -> ir.Value:
-    found, first = _numba_type(kind.struct.kinds[name]), kind.struct.places[name]
+    found = _numba_type(kind.struct.kinds[name])
+    first = kind.struct.places[name]
 
     def at(place: int) -> ir.Value:
         return builder.gep(words, [_WORD(first + place)])

@@ -68,7 +68,8 @@ def _placed(knots, time):
     k = min(_latest(knots, time), last)
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
     if s > 1.0 - _NEAR and k < last:
-        k, s = k + 1, 0.0
+        k = k + 1
+        s = 0.0
     return k, 0.0 if s < _NEAR else min(s, 1.0)
 
 
@@ -79,7 +80,10 @@ def error(robot, path, point):
     `point.nu` minus `path.point.nu`. The first is in the axes of the base at `point`, the second in
     the axes of the base at the followed point.
     """
-    e, q, there, n = path.e, point.q, path.point, len(robot.index)
+    e = path.e
+    q = point.q
+    there = path.point
+    n = len(robot.index)
     (x, y, z), w = vec.attitude(there.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
     vec.put3(e, 0, vec.times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
@@ -105,12 +109,18 @@ def track(robot, path, point, u, t):
     followed point.
     """
     # Evaluate the trajectory at the time t.
-    there, last, knots, count = path.point, len(path.t) - 2, path.t, len(path.point.u)
-    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
+    there = path.point
+    last = len(path.t) - 2
+    knots = path.t
+    count = len(path.point.u)
+    time = knots[0] + max(t, 0.0)
+    after = path.ends and t > path.over
     k, s = _placed(knots, time)
     at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
     if after:
-        k, at, share = last + 2, last + 2, 0.0
+        k = last + 2
+        at = last + 2
+        share = 0.0
     vec.copy(path.q, k * len(there.q), there.q, 0, len(there.q))
     for index in range(count):
         value = path.u[at * count + index]
@@ -128,7 +138,8 @@ def track(robot, path, point, u, t):
         vec.put3(there.u, at, vec.across(vec.axes_of(there.q), vec.get3(there.u, at)))
     # Compute the error of the robot and evaluate the gain.
     error(robot, path, point)
-    starts, width = path.starts, len(path.e)
+    starts = path.starts
+    width = len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
     k = _latest(starts, since)
     since = 0.0 if after else since - starts[k]
@@ -137,7 +148,8 @@ def track(robot, path, point, u, t):
     for row in range(count):
         total = there.u[row]
         for column in range(width):
-            at, gain = first + row * width + column, 0.0
+            at = first + row * width + column
+            gain = 0.0
             for power in range(path.order - 1, -1, -1):
                 gain = gain * since + path.K[at + power * size]
             total = total - gain * load(path.e, column)
@@ -207,7 +219,10 @@ def read_state(robot, law, point, row):
 
     `row` is the index of the row to be used from `law.origin` and from `law.near`.
     """
-    x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
+    x = law.x
+    q = point.q
+    nu = point.nu
+    n = len(robot.index)
     position, turn = vec.get3(law.origin, 7 * row), vec.attitude(law.origin, 7 * row)
     vector, scalar = vec.quaternion_times(turn, vec.attitude(q))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
@@ -230,7 +245,8 @@ def read_state(robot, law, point, row):
 
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
-    total, width = 0.0, len(x)
+    total = 0.0
+    width = len(x)
     for index in range(width):
         total = total + load(matrix, row * width + index) * load(x, index)
     return total
@@ -248,7 +264,9 @@ def command(work, robot, law, point, t, count, stage):
     row = min(count, len(law.origin) // 7 - 1)
     read_state(robot, law, point, row)
     # Compute the outputs y, with the noise of the sample.
-    outputs, gyros, tree = len(law.measured), law.gyros, robot.tree
+    outputs = len(law.measured)
+    gyros = law.gyros
+    tree = robot.tree
     if len(gyros) > 0:
         move_bodies(work, tree, point.nu)
     for index in range(len(gyros)):
@@ -292,7 +310,8 @@ def _corner(grid, corner, lane):
     """
     weight, cell = 1.0, 0
     for axis in range(len(grid.joint)):
-        first, last = grid.first[axis], grid.first[axis + 1] - 1
+        first = grid.first[axis]
+        last = grid.first[axis + 1] - 1
         value = min(max(vec.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
         k = first
         while k < last - 1 and value >= grid.values[k + 1]:

@@ -243,10 +243,12 @@ def batch_tree(robot: Robot) -> Tree | None:
         # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
         dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
         inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
-    state, size = StateMap(robot), 6 + robot.n
+    state = StateMap(robot)
+    size = 6 + robot.n
     # In v = S nu, the row of S for a joint has one nonzero entry: the joint motion per unit of the
     # coordinate that moves the joint.
-    S, of_v = state.spread(np.eye(size)).T, [joint.idx_v for joint in joints]
+    S = state.spread(np.eye(size)).T
+    of_v = [joint.idx_v for joint in joints]
     coordinate = np.abs(S).argmax(axis=1)[of_v].tolist()
     factor = S[of_v, coordinate].tolist()
     paths = _paths(size, parent, coordinate)

@@ -249,7 +249,8 @@ def _series(first):
     shares = [
         (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k) for k in range(_TERMS)
     ]
-    last, rest = shares[-1], tuple(shares[-2::-1])
+    last = shares[-1]
+    rest = tuple(shares[-2::-1])
 
     def series(x):
         total = rest[0] + x * last
@@ -312,7 +313,8 @@ def displace(tree, q, along, out):
     put3(out, 3, times(vector, short))
     store(out, 6, scalar * short)
     for body in range(1, len(tree.parent)):
-        at, value = tree.index[body], tree.factor[body] * load(along, tree.coordinate[body])
+        at = tree.index[body]
+        value = tree.factor[body] * load(along, tree.coordinate[body])
         if tree.unbounded[body]:
             c, s = load(q, at), load(q, at + 1)
             cosine, sine = cosine_and_sine(value)

@@ -140,7 +140,9 @@ class Route:
         return Accelerations(found.rates, by_y @ self.at.left, found.by_u @ self.at.V)
 
     def _matrices(self, found: Dynamics, others: list[Dynamics], inverse: Array) -> None:
-        groups, inputs, nv = self.state.groups._asdict(), self.aba.actuation.groups, len(self.M)
+        groups = self.state.groups._asdict()
+        inputs = self.aba.actuation.groups
+        nv = len(self.M)
         A, B = self._assembled(found)
         more = [self._assembled(other) for other in others]
         lower = B[nv:]
@@ -158,7 +160,8 @@ class Route:
         sums_A[nv:] += weights @ (np.abs(self.M) @ np.abs(A[nv:]))
         sums_B[nv:] += weights @ (np.abs(self.M) @ np.abs(lower))
         self.sums_A, self.sums_B = sums_A, sums_B
-        units, input_units = self.units, 1.0 / self.input_mobility
+        units = self.units
+        input_units = 1.0 / self.input_mobility
         size = np.maximum(spread_over(groups, A, units), terms_A)
         scale = scales(groups, groups, size, units, units)
         rounding = FEW_ULPS * EPS * sums_A
@@ -189,13 +192,15 @@ class Route:
 
     def _sums(self, found: Dynamics) -> tuple[Array, Array]:
         """Sum the magnitudes of the terms of A and B when they are transformed to the frame."""
-        nv, at = len(self.M), self.at
+        nv = len(self.M)
+        at = self.at
         A, B = np.zeros((2 * nv, 2 * nv)), np.zeros((2 * nv, len(self._u)))
         A[:nv, nv:] = np.eye(nv)
         A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = _norm(self.nu[ANGULAR])
         A[LINEAR, ANGULAR] = _norm(self.nu[LINEAR])
         A[nv:], B[nv:] = np.hstack((np.abs(found.by_q), np.abs(found.by_v))), np.abs(found.by_u)
-        P, left = self.frame_size, _whole(at.left, nv)
+        P = self.frame_size
+        left = _whole(at.left, nv)
         A = (P @ (A + B @ np.abs(at.H)) + _whole(at.rate, nv)) @ left
         return A, P @ B @ np.abs(at.V)
 
@@ -290,7 +295,8 @@ def _assembled(
     own: ToolCoordinates, q: Array, nu: Array, u: Array, found: Dynamics
 ) -> tuple[Array, Array]:
     """Assemble A and B from the derivatives of the accelerations; `nu` and `u` are in base axes."""
-    state, nv = own.state, len(nu)
+    state = own.state
+    nv = len(nu)
     there = own.jacobians(q, nu, u, found.rates)
     # Assemble A_y and B_y of (4.9). The upper half of A_y is the kinematics of a small displacement
     # in axes that rotate with the base.
@@ -298,6 +304,7 @@ def _assembled(
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
     A[:nv, nv:] = np.eye(nv)
-    A[nv:], B[nv:] = np.hstack((found.by_q, found.by_v)), found.by_u
+    A[nv:] = np.hstack((found.by_q, found.by_v))
+    B[nv:] = found.by_u
     A = (there.P @ (A + B @ there.H) + there.rate) @ there.left
     return A, there.P @ B @ there.V

@@ -227,7 +227,8 @@ class References:
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare a model that has this operating point."""
-        route, least = self.route, ROUTE_TOLERANCE
+        route = self.route
+        least = ROUTE_TOLERANCE
         yield from self._blocks("ABA derivatives", lin, route.A, route.B, least)
         yield from self._blocks("differences", lin, *self._differences, DIFFERENCE_TOLERANCE)
         if self._outputs is None:
@@ -248,7 +249,8 @@ class References:
     def _blocks(
         self, test: str, lin: LinearModel, A: Reference, B: Reference, least: float
     ) -> Iterator[Row]:
-        groups, inputs = self.route.state.groups._asdict(), self.route.aba.actuation.groups
+        groups = self.route.state.groups._asdict()
+        inputs = self.route.aba.actuation.groups
         of_A, of_B = A.errors(lin.A, least), B.errors(lin.B, least)
         for row, rows in groups.items():
             for column, columns in groups.items():
@@ -278,7 +280,8 @@ class References:
         modes.
         """
         route, g = self.route, self.route.state.groups
-        nx, nu = route.state.nx, len(lin.u0)
+        nx = route.state.nx
+        nu = len(lin.u0)
         # A unit of the amplitude of a mode moves its body by `scale` [rad or m]. A body that hardly
         # rotates also translates. Because the modal mass is 1, it translates by at least 1 /
         # sqrt(mass) [m] per unit of the amplitude.
@@ -311,7 +314,9 @@ class References:
     def _by_differences(self, lin: LinearModel) -> tuple[Reference, Reference]:
         """Return A and B by finite differences of the nonlinear model."""
         route, model = self.route, self._model
-        nx, nv, g = route.state.nx, len(route.M), route.state.groups
+        nx = route.state.nx
+        nv = len(route.M)
+        g = route.state.groups
         # The steps of the joint positions must be small. If light links are aligned, even a small
         # rotation of a joint strongly changes the accelerations. Only the attitude and the joint
         # positions need sixth-order differences.

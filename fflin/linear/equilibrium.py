@@ -223,7 +223,9 @@ def equilibrium(
             f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
             f"forces: {listed(forces)}; {advice}, or choose another point"
         )
-    at, u, actuation = balance.lin.q, balance.u, Actuation(state)
+    at = balance.lin.q
+    u = balance.u
+    actuation = Actuation(state)
     if reference is not None or robot.orbit:
         base = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(at[:7])
         R = state.reference.rotation.T @ base.rotation
@@ -246,7 +248,8 @@ def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
 
     The base is displaced in the plane that is perpendicular to the orbit.
     """
-    placed, root = q.copy(), robot.model.jointPlacements[ROOT]
+    placed = q.copy()
+    root = robot.model.jointPlacements[ROOT]
     along = OrbitField(robot, frame).axes[:, 1]
     center = pin.centerOfMass(robot.model, robot.create_data(), q)
     placed[:3] -= root.rotation.T @ (center - (center @ along) * along)
@@ -326,7 +329,8 @@ class _Balance:
         drift = lin.rate
         _require_steady(lin, drift)
         columns = actuation.columns(robot.create_data(), lin.q)
-        M, acceleration = lin.M, drift[-len(lin.M) :]
+        M = lin.M
+        acceleration = drift[-len(lin.M) :]
         inverse = np.linalg.inv(M)
         mobility = np.sqrt(inverse.diagonal())
         terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
@@ -604,7 +608,8 @@ def relative_equilibria(
         )
     q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
     q[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
-    data, root = robot.create_data(), robot.model.jointPlacements[ROOT]
+    data = robot.create_data()
+    root = robot.model.jointPlacements[ROOT]
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center = root.actInv(data.com[0])
     sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
@@ -613,14 +618,17 @@ def relative_equilibria(
             f"'{robot.name}' has no inertia about one axis; give the link an inertia about every "
             "axis"
         )
-    n, found, field = mean_motion(robot), [], OrbitField(robot, frame_of(robot, frame))
+    n = mean_motion(robot)
+    found = []
+    field = OrbitField(robot, frame_of(robot, frame))
     rounding = _ROUNDING * (sizes[2] / sizes[0]) ** 2
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs
         if np.linalg.det(own) < 0.0:
             continue
         R = field.axes @ own.T
-        at, moments = q.copy(), sizes[list(order)]
+        at = q.copy()
+        moments = sizes[list(order)]
         at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
         radial, along, normal = moments.tolist()
         pitch = 3.0 * (along - radial) / normal

@@ -133,7 +133,9 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
-    sampled, whole, step = lin.dt, lin.generator, step_of(tool, dt)
+    sampled = lin.dt
+    whole = lin.generator
+    step = step_of(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform its continuous-time model instead")
     lin, (kind, own, to, rates) = whole, _jacobians_at(robot, whole, tool)
@@ -156,7 +158,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     inputs = {kind.actuation.names[i]: kind.actuation.units[i] for i in kind.inputs}
     for signal, units in (("state", states), ("input", inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
-    T_u, about = np.linalg.solve(to.V, own.V), "moving" if lin.moving else "fixed"
+    T_u = np.linalg.solve(to.V, own.V)
+    about = "moving" if lin.moving else "fixed"
     fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
     fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
     return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
@@ -193,7 +196,8 @@ class ToolGain(Design):
 
 def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     """Convert the gain K of a model to a tool's coordinates, with the same closed-loop poles."""
-    model, whole = lin.to(tool), lin.generator
+    model = lin.to(tool)
+    whole = lin.generator
     assert whole is not None and lin._robot is not None
     _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
     # The input axes of the tool may rotate relative to the input axes of the model. In this case,
@@ -298,7 +302,8 @@ def _jacobians_at(
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
     own = ToolCoordinates(state, moving=lin.moving)
     kind = tool_coordinates(robot, tool, moving=lin.moving)
-    nu, rates = state.velocities(lin.v), lin.drift
+    nu = state.velocities(lin.v)
+    rates = lin.drift
     point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
     if rates is None:  # f0 = P dy/dt
         rates = own.jacobians(*point, 0.0 * nu).left @ lin.f0
@@ -335,10 +340,13 @@ def euler_step(A: Array, B: Array, rate: Array, h: float, tool: str) -> tuple[Ar
     base, linear rows precede angular rows.
     """
     v, a = np.split(rate, 2)
-    nv, moved = len(v), h * (v + h * a)
-    K, G = np.eye(nv), h * np.eye(nv)
+    nv = len(v)
+    moved = h * (v + h * a)
+    K = np.eye(nv)
+    G = h * np.eye(nv)
     if tool == "mujoco":
-        K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
+        K[3:6, 3:6] = pin.exp3(-moved[3:6])
+        G[3:6, 3:6] = h * pin.Jexp3(moved[3:6])
     else:
         K[:6, :6] = pin.exp6(-moved[:6]).toActionMatrix()
         G[:6, :6] = h * pin.Jexp6(moved[:6])

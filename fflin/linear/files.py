@@ -247,7 +247,8 @@ def arguments(
     u = u[:, None] if u.ndim == 1 else u
     if u.ndim != 2:
         raise InputError(f"u has shape {u.shape}, expected one row of inputs for each knot")
-    names, there = actuation.names, texts(entries.get("input_names", actuation.names))
+    names = actuation.names
+    there = texts(entries.get("input_names", actuation.names))
     if names != there or u.shape[-1] != len(names):
         lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
         said = f"; it lacks the inputs {listed(lacking)}" if lacking else ""

@@ -70,7 +70,8 @@ def require_same(
     " was " must name the object. If `units` is None, only names are compared. If `part` is True,
     the robot may have further signals.
     """
-    robot, others = state.robot, dict(zip(*signals_of(state, kind), strict=True))
+    robot = state.robot
+    others = dict(zip(*signals_of(state, kind), strict=True))
     if part and names != tuple(others):
         others = {name: others[name] for name in names if name in others}
     if names == tuple(others) and units in (None, tuple(others.values())):

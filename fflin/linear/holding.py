@@ -94,7 +94,8 @@ def wheel_notes(lin: LinearModel) -> tuple[str, ...]:
     """
     if "q_b.x" not in lin.state_names:
         return ()
-    rate, n = momentum_rate(lin), lin.mean_motion
+    rate = momentum_rate(lin)
+    n = lin.mean_motion
     torque = float(np.linalg.norm(rate))
     if torque <= lin.bound(TOLERANCE) * float(lin.M[:3, :3].diagonal().max()):
         return ()

@@ -322,9 +322,12 @@ def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps
     """Yield the steps and the transition matrix of each sample, for the samples of `_through`."""
     for first in range(0, len(cuts), _BATCH):
         batch = cuts[first : first + _BATCH]
-        found, parts, pending = _through(traj, batch, 1), 1, list(range(len(batch)))
+        found = _through(traj, batch, 1)
+        parts = 1
+        pending = list(range(len(batch)))
         while pending and parts < _MOST_PARTS:
-            parts, coarse = 2 * parts, pending
+            parts = 2 * parts
+            coarse = pending
             finer = _through(traj, [batch[k] for k in coarse], parts)
             pending = []
             for k, each in zip(coarse, finer, strict=True):

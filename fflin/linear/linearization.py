@@ -60,7 +60,8 @@ class Prepared:
     def __init__(
         self, robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
     ) -> None:
-        self.robot, self.moving = robot, truth("moving", moving)
+        self.robot = robot
+        self.moving = truth("moving", moving)
         if moving:
             refuse_orbit(robot, "models with moving=True")
         frame = "local" if moving and frame is None else frame
@@ -79,7 +80,9 @@ class Prepared:
             self.sensing = Sensing(state, robot.outputs, own_reference=self.own_reference)
         acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
         self.free = self.sensing is None and not moving and not acts
-        nx, nv, nu = state.nx, state.nx // 2, len(self.actuation.names)
+        nx = state.nx
+        nv = state.nx // 2
+        nu = len(self.actuation.names)
         self.common: dict[str, Any] = {
             "C": frozen(np.eye(nx)),
             "D": frozen(np.zeros((nx, nu))),
@@ -233,8 +236,10 @@ class Linearizer:
         self._data = robot.create_data()
         self._lock = Lock()  # protects the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
-        nv, nx = ready.map.nx // 2, ready.map.nx
-        self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
+        nv = ready.map.nx // 2
+        nx = ready.map.nx
+        self._shape_B = (nx, len(ready.actuation.names))
+        self._lower = slice(nv, nx)
         self._rate = "drift" if ready.moving else "f0"
         # Fields of a model at rest, except B and q. The fields in `slow` are computed at the first
         # use, because they are expensive.
@@ -272,7 +277,9 @@ class Linearizer:
 
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
-        inertia, actuation, nv = self._accelerations.inertia, self.prepared.actuation, len(out)
+        inertia = self._accelerations.inertia
+        actuation = self.prepared.actuation
+        nv = len(out)
         with self._lock:
             inverse = out if actuation.default else np.empty((nv, nv))
             inertia.invert(q, inverse)
@@ -316,12 +323,16 @@ class Linearizer:
 
         Each model must be relative to the base placement at its point.
         """
-        ready, lower, count = self.prepared, self._lower, len(q)
+        ready = self.prepared
+        lower = self._lower
+        count = len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = Standing(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
         A, B = np.tile(ready.rest["A"], (count, 1, 1)), np.zeros((count, *self._shape_B))
-        c, gravity, seen = np.empty_like(nu), np.empty((count, 3)), []
+        c = np.empty_like(nu)
+        gravity = np.empty((count, 3))
+        seen = []
         with self._lock:
             for k, point in enumerate(zip(q, v, nu, u, strict=True)):
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])

@@ -94,7 +94,8 @@ class Nonlinear:
         (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
         # Evaluate each motion at the times t = +-h, +-2 h and +-3 h.
         h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
-        t, speeds = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None], np.tile(v, (6, 1))
+        t = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None]
+        speeds = np.tile(v, (6, 1))
         moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
         after = coordinates.state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
         # The rates of a moving reference cancel in the errors, but not their rounding errors.

@@ -55,7 +55,8 @@ class OutputReference:
 
         y0 = self._measuring(lin.x0, lin.q, route.v, self._a)[:, None]
         by_x, rounding, sizes = self._kinematics(steps)
-        by_a, at = self._by_acceleration(), route.accelerations
+        by_a = self._by_acceleration()
+        at = route.accelerations
         size, nv, ones = np.abs(by_a), len(route.M), np.ones(len(y0))
         C, D = by_x + by_a @ at.by_x, by_a @ at.by_u
 
@@ -66,7 +67,8 @@ class OutputReference:
         scale = self._scale(C, np.abs(by_x) + size @ np.abs(at.by_x), halves, route.units)
         rounding += sampled_errors(C, [by_x + by_a @ other.by_x for other in route.samples])
         self.C = Reference(C, scale, rounding)
-        inputs, units = route.aba.actuation.groups, 1.0 / route.input_mobility
+        inputs = route.aba.actuation.groups
+        units = 1.0 / route.input_mobility
         scale = self._scale(D, size @ np.abs(at.by_u), inputs, units)
         self.D = Reference(D, scale, sampled_errors(D, [by_a @ x.by_u for x in route.samples]))
         rates = np.abs(route.state.velocities(self._a))
@@ -95,13 +97,15 @@ class OutputReference:
     def _kinematics(self, steps: Array) -> tuple[Array, Array, Array]:
         """Return dh/dx, its rounding errors, and the magnitudes (ny,) of the terms of h."""
         state, lin, x = self._route.state, self._lin, self._lin.x0
-        groups, ny = state.groups, len(lin.y0)
+        groups = state.groups
+        ny = len(lin.y0)
         is_curved = np.zeros(len(x), dtype=bool)
         is_curved[groups.q_b] = is_curved[groups.q_m] = True
         here = self._evaluate(x[None], self._a)[0]
         # h is linear in the accelerations, so its derivatives by velocities do not depend on them.
         # Without them, h is small, and so are its rounding errors.
-        nv, steady = len(x) // 2, np.zeros_like(self._a)
+        nv = len(x) // 2
+        steady = np.zeros_like(self._a)
         unaccelerated = self._evaluate(x[None], steady)[0]
 
         def differences(part: slice, a: Array) -> Array:
@@ -118,7 +122,8 @@ class OutputReference:
         by_x, *again = np.concatenate((by_positions, by_velocities), axis=2)
 
         parts = {k: np.arange(k, k + 3) for k in range(ny, len(here), 3)}
-        vectors, ones = {**self._vectors, **parts}, np.ones(len(here))
+        vectors = {**self._vectors, **parts}
+        ones = np.ones(len(here))
         places = [lin.reference, *state.robot.model.jointPlacements.tolist()]
         reach = sum(float(np.linalg.norm(place.translation)) for place in places)
         reach += float(np.linalg.norm(lin.q[:3]))
@@ -197,7 +202,8 @@ class _Bodies:
     def __init__(self, state: StateMap, home: Array) -> None:
         robot = state.robot
         bodies = robot.model.inertias.tolist()
-        self._home, self._total = home, robot.mass
+        self._home = home
+        self._total = robot.mass
         stored = np.zeros((len(bodies), 3))
         for joint, momentum in robot.stored_momentum:
             stored[joint] += momentum
@@ -281,7 +287,9 @@ def _moved_by(state: StateMap, count: int) -> Mask:
 
 def _parts(state: StateMap) -> tuple[dict[str, list[int]], dict[int, Indices]]:
     """Return the rows of y by the name of the output, and the rows of each of its vectors."""
-    kinds, vectors, at = dict[str, list[int]](), dict[int, Indices](), 0
+    kinds = dict[str, list[int]]()
+    vectors = dict[int, Indices]()
+    at = 0
     for output in state.robot.outputs:
         count = len(output.signals) or len(state_indices(state, output))
         kinds.setdefault(output.WORD, []).extend(range(at, at + count))

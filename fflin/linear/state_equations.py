@@ -34,7 +34,9 @@ def assemble(
     and `u` are in base axes.
     """
     state = actuation.state
-    g, nv, lower = state.groups, state.nx // 2, rates.slopes
+    g = state.groups
+    nv = state.nx // 2
+    lower = rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
@@ -73,7 +75,8 @@ def assemble(
     if state.orbit:  # (14.2), (14.5), (14.6)
         turn, pull = state.orbit
         spin = chart.R.mT @ turn
-        A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
+        A[..., g.v_b, g.r_b] = pull
+        A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
         A[..., g.omega_b, g.omega_b] -= skew(spin)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
@@ -147,14 +150,16 @@ def output_equations(
 
     `point` consists of q and v in Pinocchio's order, and of nu (6 + n,) and u (nu,) in base axes.
     """
-    state, a = sensing.state, rates.c.copy()
+    state = sensing.state
+    a = rates.c.copy()
     q, v, nu, u = point
     if sensing.needs_acceleration:
         a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
     sensed = sensing.evaluate(data, q, v, state.spread(a))
     g = state.groups
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
-    turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
+    turn = by_q[:, ANGULAR].copy()
+    by_q_m = by_q[:, 6:]
     D: Array = np.zeros((len(by_q), len(u)))
     if sensing.needs_acceleration:
         by_rate = state.columns(sensed.by_a)

@@ -70,7 +70,8 @@ class ToolCoordinates:
     """Coordinates of a tool, or of fflin's own models, relative to a `StateMap`'s reference."""
 
     def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
-        robot, own = state.robot, not tool
+        robot = state.robot
+        own = not tool
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
         self.tangent = kind.attitude in ("tangent", "pose")
@@ -111,7 +112,8 @@ class ToolCoordinates:
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
-        kind, found = self.convention, dict[str, str]()
+        kind = self.convention
+        found = dict[str, str]()
         attitude = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
         omega = [f"{x}_rate" for x in attitude] if kind.rates else [f"omega.{x}" for x in "xyz"]
         pose, twist = [*attitude, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
@@ -138,7 +140,9 @@ class ToolCoordinates:
 
     def to_pinocchio(self, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
         """Convert the tool's q and v to Pinocchio's q and v; v=None means zero velocity."""
-        robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
+        robot = self.state.robot
+        state = self.state
+        size = 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
             return robot.checked_configuration(q), robot.checked_velocity(v)
@@ -206,7 +210,10 @@ class ToolCoordinates:
         `q` is in Pinocchio's order. `nu`, `u` and `rates` are in base axes. `rates` (6 + n,) is the
         time derivative of `nu`.
         """
-        n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
+        n = self.state.robot.n
+        nv = 6 + len(self.joints)
+        X = self._X
+        kind = self.convention
         here, R_now = self._attitude(q)
         # Take a complex step along the motion. If the reference moves with the robot, the attitude
         # error and the tangent vector of the pose stay zero, so they take no step.
@@ -214,7 +221,9 @@ class ToolCoordinates:
         moved = (not self._moving) * _STEP * twist.real
         turns = 0.5 * product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
         quaternion = here + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
-        R, w, vec = rotation_matrix(quaternion), quaternion[3], quaternion[:3]
+        R = rotation_matrix(quaternion)
+        w = quaternion[3]
+        vec = quaternion[:3]
         by_turn = -self._rotated(R) @ self._held(twist)
         attitude: Any = np.eye(3) + 0.5 * skew(moved[ANGULAR])
         if kind.attitude == "euler":
@@ -229,7 +238,8 @@ class ToolCoordinates:
         base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
         if kind.attitude == "pose":
             base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
-        base[k:, :3], base[k:, 6:] = by_turn, self._rotated(R, rates=kind.rates)
+        base[k:, :3] = by_turn
+        base[k:, 6:] = self._rotated(R, rates=kind.rates)
         base[:k], base[k:] = np.roll(base[:k], self._roll, 0), np.roll(base[k:], self._roll, 0)
         first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
@@ -244,7 +254,8 @@ class ToolCoordinates:
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        wrench, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
+        wrench = self._wrench
+        H = np.zeros((len(u), 12 + 2 * n))
         V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
         held = self._held(np.linalg.solve(X.T, wrench @ u))
         H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
@@ -282,7 +293,9 @@ def _joint_path(robot: Robot, name: str) -> list[int]:
 
     A frame that is not a joint of the URDF, such as a link, gets an index after the last joint.
     """
-    frames, path, order = robot.model.frames, list[int](), robot.file_joints
+    frames = robot.model.frames
+    path = list[int]()
+    order = robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
         name, at = frames[at].name, frames[at].parentFrame

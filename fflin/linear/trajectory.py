@@ -430,7 +430,9 @@ class Trajectory(Design):
             jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
             return float(np.maximum(miss, jump).max())
 
-        found, steps, model = [], 1, self.robot.model
+        found = []
+        steps = 1
+        model = self.robot.model
         # If the knots are not a motion of the robot, the integration may overflow. The error of the
         # interval is infinite in this case, so suppress NumPy's warnings about the overflow.
         with np.errstate(all="ignore"):
@@ -438,7 +440,8 @@ class Trajectory(Design):
                 steps = max(1, steps // 4)
                 end = self.end(k, steps, q[k], v[k])
                 while steps < _MOST_STEPS:
-                    before, steps = end, 2 * steps
+                    before = end
+                    steps = 2 * steps
                     end = self.end(k, steps, q[k], v[k])
                     apart = pin.difference(model, before[0], end[0])
                     change = size(apart, end[1] - before[1], h)
@@ -449,7 +452,8 @@ class Trajectory(Design):
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
-        start, h = self.t[k], self.t[k + 1] - self.t[k]
+        start = self.t[k]
+        h = self.t[k + 1] - self.t[k]
         method = CommutatorFree4(self.robot.model, h / steps)
 
         def rate(t: float, q: Array, v: Array) -> Array:
@@ -463,7 +467,10 @@ class Trajectory(Design):
     @cached_property
     def cubics(self) -> Array:
         """Coefficients (2, N - 1, 4, nv) of the cubic polynomials for displacement and velocity."""
-        q, v, h, model = self.q, self.v, np.diff(self.t)[:, None], self.robot.model
+        q = self.q
+        v = self.v
+        h = np.diff(self.t)[:, None]
+        model = self.robot.model
         begin = self._aba.accelerations(q, v, self.u_base)
         end = begin[1:]
         if self.hold == "previous":
@@ -547,7 +554,8 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
     held = Trajectory(robot, **values)
     if not (motion.u - motion.u[0]).any():
         return held
-    before, u = motion.t[-4:-1] - motion.t[-1], values["u"]
+    before = motion.t[-4:-1] - motion.t[-1]
+    u = values["u"]
     u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
     smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
     return min(held, smooth, key=lambda each: float(each.residual.max()))

@@ -124,7 +124,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
     elif scheme == "file":
         candidates = [Path(unquote(rest))]
     else:
-        folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
+        folders = (*package_dirs, *urdf.resolve().parents)
+        inside = Path(*Path(rest).parts[1:])
         # Each of these folders may contain the folder NAME of the package, or may itself be the
         # folder of the package, possibly under another name.
         candidates = [folder / part for part in (rest, inside) for folder in folders]

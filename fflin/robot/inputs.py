@@ -40,7 +40,8 @@ class Input:
             if value is not None and not (isinstance(value, str) and value):
                 raise InputError(f"{self.KEY} {name} is {value!r}, expected a name")
         for name in ("max", "min"):
-            value, what = getattr(self, name), f"{self.KEY} {name}"
+            value = getattr(self, name)
+            what = f"{self.KEY} {name}"
             if value is not None:
                 several = len(self.ENTRIES) > 1 and dimension(what, value)
                 self._set(name, three_numbers(what, value) if several else number(what, value))

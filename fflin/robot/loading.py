@@ -115,14 +115,17 @@ def load(
     """
     found, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
     arguments = _xacro_arguments(xacro)
-    document, later, of_file = None, dict[str, float | None](), dict[str, object]()
+    document = None
+    later = dict[str, float | None]()
+    of_file = dict[str, object]()
     if found.path.suffix.lower() == ".toml":
         document, found, of_file = _read_robot_file(found)
         with document.located("lock"):
             own = requested(of_file.pop("lock", ()))
         with document.located("xacro"):
             arguments = _xacro_arguments(of_file.pop("xacro", None)) | arguments
-        later, locks = locks, {name: locks.pop(name, value) for name, value in own.items()}
+        later = locks
+        locks = {name: locks.pop(name, value) for name, value in own.items()}
     urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path, arguments)
     with document.located("lock") if document else nullcontext():
         loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
@@ -476,7 +479,8 @@ def _built(
         raise document.error(f"{key} is not an array of tables; write [[{key}]]", key)
     built = []
     for index, table in enumerate(tables):
-        values, name = {**table}, table.get("name")
+        values = {**table}
+        name = table.get("name")
         of = f"{key} {index + 1}" + (f" ('{name}')" if isinstance(name, str) else "")
         with document.located(key, index, of=f"{of}: "):
             build = choose(values)

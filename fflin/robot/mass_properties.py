@@ -61,10 +61,13 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
         if frame.type == pin.FrameType.BODY and frame.name not in index_of:
             index_of[frame.name] = frame.parentJoint
             links.setdefault(frame.parentJoint, []).append(frame.name)
-    names, done, new = [*index_of], dict[int, object](), dict[int, pin.Inertia]()
+    names = [*index_of]
+    done = dict[int, object]()
+    new = dict[int, pin.Inertia]()
     for place, value in by_name("body", given, names).items():
         name, index = names[place], index_of[names[place]]
-        body, part = "base" if index == ROOT else model.names[index], place >= first_link
+        body = "base" if index == ROOT else model.names[index]
+        part = place >= first_link
         if (part and links[index][1:]) or done.setdefault(index, value) is not value:
             raise InputError(
                 f"'{name}' is part of the body '{body}' with the links "
@@ -196,18 +199,23 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
     - Each body is a piece. A body with only one link is the same piece as the link, and has the
       name of the link.
     """
-    model, found = robot._bare.model, dict[str, Piece]()
+    model = robot._bare.model
+    found = dict[str, Piece]()
     bodies = ["base" if joint == ROOT else name for joint, name in enumerate(model.names)]
     of_body: dict[int, dict[str, Piece]] = {}
     for name, link in robot.links.items():
         if model.existFrame(name, pin.FrameType.BODY):
             joint, at = find_frame(model, name)
-            placement, body = at * link.placement, bodies[joint]
+            placement = at * link.placement
+            body = bodies[joint]
             piece = Piece(joint, placement, link.mass, link.inertia, at, body)
             of_body.setdefault(joint, {})[name] = piece
     for joint in range(ROOT, model.njoints):
-        inertia, named = model.inertias[joint], of_body.get(joint, {})
-        at, axes, several = pin.SE3(np.eye(3), inertia.lever), pin.SE3.Identity(), len(named) > 1
+        inertia = model.inertias[joint]
+        named = of_body.get(joint, {})
+        at = pin.SE3(np.eye(3), inertia.lever)
+        axes = pin.SE3.Identity()
+        several = len(named) > 1
         whole = Piece(joint, at, inertia.mass, inertia.inertia, axes, bodies[joint], several)
         total = sum((as_inertia(each) for each in named.values()), pin.Inertia.Zero())
         difference = np.abs(total.matrix() - inertia.matrix()).max()
@@ -307,7 +315,8 @@ def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) 
     placements = {body: pin.SE3.Identity()}
     columns = {body: np.zeros((6, len(modes)))}
     for at, index in enumerate(mode_joints):
-        parent, joint_data = model.parents[index], model.joints[index].createData()
+        parent = model.parents[index]
+        joint_data = model.joints[index].createData()
         model.joints[index].calc(joint_data, pin.neutral(model))
         placements[index] = placements[parent] * model.jointPlacements[index]
         columns[index] = columns[parent].copy()
@@ -323,7 +332,8 @@ def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) 
         M += V.T @ to_center.act(inertia).matrix() @ V
     # Scale M to a matrix with entries of at most 1, so that its rounding errors are known.
     sizes = M.diagonal().copy()
-    sizes[:3], sizes[3:6] = mass, np.linalg.eigvalsh(M[3:6, 3:6])[-1]
+    sizes[:3] = mass
+    sizes[3:6] = np.linalg.eigvalsh(M[3:6, 3:6])[-1]
     scale = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, axes = np.linalg.eigh(M / np.outer(scale, scale))
     rows = axes[:, values > _NO_MOMENT].T * scale / scale[0]
@@ -435,7 +445,8 @@ def _moved(robot: Robot, q: Array, parts: Sequence[_Part]) -> Array:
 
     These are the rates of joints with armature and the rows of all parts.
     """
-    model, data = robot.model, robot.create_data()
+    model = robot.model
+    data = robot.create_data()
     pin.computeJointJacobians(model, data, q)
     armature = model.armature > 0.0
     armature[[joint.idx_v for joint in robot.modes]] = False  # included in `parts`

@@ -355,7 +355,8 @@ class Robot(Coordinates):
         model = bare.model.copy()
         for joint, body in bodies.items():
             model.inertias[joint] = body
-        digest, masses = self.urdf_sha256, mass_properties.dynamic_parameters(model)
+        digest = self.urdf_sha256
+        masses = mass_properties.dynamic_parameters(model)
         if masses != mass_properties.dynamic_parameters(bare.model):
             digest = sha256(digest.encode() + masses).hexdigest()
         other = replace(bare, model=model, urdf_sha256=digest)
@@ -366,7 +367,8 @@ class Robot(Coordinates):
             return changed
         # `changed` has new joints for the modes. Use the old joints instead, so that the modal
         # amplitudes in q have the same meaning as before.
-        model, own = self.model.copy(), self.model.inertias
+        model = self.model.copy()
+        own = self.model.inertias
         for joint in bodies:
             at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
             mounted = bare.model.inertias[joint] - own[at]

@@ -167,7 +167,8 @@ def _is_symmetric(robot: Robot, index: int) -> bool:
     axis = spin_axis(robot, index)
     if not axis.any():  # a joint that translates
         return False
-    body, turn = robot.model.inertias[index], skew(axis)
+    body = robot.model.inertias[index]
+    turn = skew(axis)
     uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
     largest = float(np.abs(body.inertia).max())
     offset = body.mass * float(np.square(turn @ body.lever).sum())

@@ -26,7 +26,8 @@ _LOOKS = {
 
 # Frequency [rad/s] and damping ratio of the springs and dampers that a draft suggests for joints
 # without a motor.
-_SWING, _DAMPED = math.pi, 0.01
+_SWING = math.pi
+_DAMPED = 0.01
 
 # Inertia [kg m^2], torque [N m] and largest speed [rad/s] of a small reaction wheel, which a draft
 # suggests if the URDF does not give them.
@@ -86,7 +87,8 @@ def _tree(robot: Robot) -> list[list[str]]:
         depth[index] = depth[model.parents[index]] + 1
         rates = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
         cells = (f"{x:.5g}" if abs(x) < 1e300 else "." for x in (*travel_of(model, joint), *rates))
-        name, mass = "  " * depth[index] + joint.name, f"{masses[index]:.6g}"
+        name = "  " * depth[index] + joint.name
+        mass = f"{masses[index]:.6g}"
         rows.append([name, kinds[joint], mass, *cells])
     return rows
 
@@ -185,9 +187,11 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
     An input is suggested for each link with a name such as "wheel" or "thruster". All lines of the
     text are TOML comments. The names of joints are quoted as TOML strings.
     """
-    model, data = robot.model, robot.create_data()
+    model = robot.model
+    data = robot.create_data()
     pin.framesForwardKinematics(model, data, robot.neutral())
-    text, spun = "", []
+    text = ""
+    spun = []
 
     def in_order(index: int) -> list[tuple[float, str]]:  # numbers in names compare by value
         parts = re.split(r"([0-9]+)", model.frames[index].name)
@@ -198,11 +202,15 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
         kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
         if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
             continue
-        axis, lines, lock = np.array([0.0, 0.0, 1.0]), ["max = 1.0  # [N]"], ""
-        name, key = _text(frame.name), "direction"
+        axis = np.array([0.0, 0.0, 1.0])
+        lines = ["max = 1.0  # [N]"]
+        lock = ""
+        name = _text(frame.name)
+        key = "direction"
         if kind == "reaction_wheel":
             # The name of a wheel must differ from the names of all joints and frames.
-            name, key = _text(f"{frame.name}_rotor"), "axis"
+            name = _text(f"{frame.name}_rotor")
+            key = "axis"
             joint = model.joints[frame.parentJoint]
             if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
                 axis = np.asarray(data.joints[frame.parentJoint].S).reshape(6)[3:]

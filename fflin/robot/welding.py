@@ -23,7 +23,8 @@ Lock = Mapping[str, float | None] | Iterable[str]
 
 def welded(robot: Robot, lock: Lock) -> Robot:
     """Return a robot with joints and wheels welded; `lock` gives their names and positions."""
-    bare, asked = robot._bare, requested(lock)
+    bare = robot._bare
+    asked = requested(lock)
     wheels = {name for name in asked if name in robot.reaction_wheels}
     at = {name: value for name, value in asked.items() if name not in wheels}
     mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
@@ -73,7 +74,9 @@ def locked_model(
     for name, mimic in mimics.items():
         if values.get(name) is None and (name in values or mimic.leader in values):
             values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
-    q, indices, locked = pin.neutral(model), [], []
+    q = pin.neutral(model)
+    indices = []
+    locked = []
     for name, value in values.items():
         index = model.getJointId(name)
         indices.append(index)
@@ -148,7 +151,8 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         followers=tuple(each.within(model) for each in (*bare.followers, *theirs)),
         links=both.pop("links"),
     )
-    name, attached = f"{robot.name}+{other.name}", (*robot.attached, (prefix, other))
+    name = f"{robot.name}+{other.name}"
+    attached = (*robot.attached, (prefix, other))
     return equipped(replace(robot, name=name, attached=attached, **both), bare)
 
 

@@ -57,7 +57,9 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
 
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
-    plant, policy, times = plan.plant, decider(plan.policy), plan.times
+    plant = plan.plant
+    policy = decider(plan.policy)
+    times = plan.times
     designs = [plan.policy.design] if isinstance(plan.policy, Allocation) else []
     reason = ""
     if not numba_is_there():
@@ -146,8 +148,10 @@ class LaneLoop:
         if runs:  # at the start of dispersed runs, q0 of `StopConditions` is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
-        self._plan, self._state = plan, plan.plant.state
-        self._ending, self._noisy = ending_of(plan, stop), len(parts.law.added) > len(parts.law.y)
+        self._plan = plan
+        self._state = plan.plant.state
+        self._ending = ending_of(plan, stop)
+        self._noisy = len(parts.law.added) > len(parts.law.y)
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
         self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
@@ -155,7 +159,8 @@ class LaneLoop:
         self._advance = kernel("loop", "advance")
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
-        self.width, self.done = int(self.ends[-1]), 0
+        self.width = int(self.ends[-1])
+        self.done = 0
         self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
         self._of_run |= robot.tree._asdict() | robot.faults._asdict()
 
@@ -169,7 +174,8 @@ class LaneLoop:
         `statistics.over` ends a run, the returned text is empty.
         """
         times, every, point = self._plan.times, statistics.every, self.parts.point
-        steps, count = times.steps, len(next(iter(out.values()))) if out else 1
+        steps = times.steps
+        count = len(next(iter(out.values()))) if out else 1
         of_lane = np.minimum(np.arange(LANES), count - 1)
         sense = self._begin(runs or {}, of_lane)
         statistics.reset()
@@ -180,7 +186,8 @@ class LaneLoop:
         span = min(most * every, statistics.span)
         if self._noisy:
             span = min(span, SLOTS * times.sample)
-        clock, messages = np.zeros(1, dtype=np.intp), [""] * count
+        clock = np.zeros(1, dtype=np.intp)
+        messages = [""] * count
         going, bar = np.ones(count, dtype=bool), Progress(self._plan.options.progress)
         try:
             while self.done < steps and going.any():
@@ -230,8 +237,10 @@ class LaneLoop:
         robot, kept = self.parts.robot, self.parts.reference
         mass = robot.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
-        kept.start[9:], self.done = self.parts.point.q[:3], 0
-        law, size = self.parts.law, len(self.parts.law.y)
+        kept.start[9:] = self.parts.point.q[:3]
+        self.done = 0
+        law = self.parts.law
+        size = len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))
         bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
@@ -255,7 +264,9 @@ class LaneLoop:
 
     def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
         """Write the outcomes of the runs that end at the current step into `out`."""
-        point, kept, count = self.parts.point, self.parts.reference, len(ending)
+        point = self.parts.point
+        kept = self.parts.reference
+        count = len(ending)
         conserved = kept.start[:9] + kept.sums[:9]
         conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
         last = np.vstack((point.q, point.nu, self.parts.method.u, conserved))
@@ -272,7 +283,8 @@ class LaneRows(Statistics):
     """Recorded rows of a single run, with the columns that `LaneLoop` describes."""
 
     def __init__(self, times: Times, width: int) -> None:
-        self.every, self.kept = times.every, np.empty((times.rows, width))
+        self.every = times.every
+        self.kept = np.empty((times.rows, width))
 
     def add(self, first: int, rows: Array) -> None:
         """Store rows; see `Statistics`."""
@@ -282,7 +294,9 @@ class LaneRows(Statistics):
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     """Simulate a plan with the compiled loop; `runs` contains the values of one dispersed run."""
-    every, dt, loop = plan.times.every, plan.times.dt, LaneLoop(plan, runs)
+    every = plan.times.every
+    dt = plan.times.dt
+    loop = LaneLoop(plan, runs)
     rows = LaneRows(plan.times, loop.width)
     try:
         [stopped] = loop.fly(rows, {}, runs)
@@ -343,7 +357,9 @@ def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loo
 
 def mechanics_of(plant: Plant) -> forward.Mechanics:
     """Return the kernel's parameters of the robot and the actuators of a plant."""
-    robot, actuation, tree = plant.robot, plant.actuation, batch_tree(plant.robot)
+    robot = plant.robot
+    actuation = plant.actuation
+    tree = batch_tree(plant.robot)
     springs = robot.springs
     assert tree is not None
     return forward.Mechanics(
@@ -383,7 +399,9 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     first computes commands for the inputs of that robot. It then allocates these commands to the
     inputs of the simulated robot.
     """
-    asking, policy, state = plan.plant, decider(plan.policy), plan.plant.state
+    asking = plan.plant
+    policy = decider(plan.policy)
+    state = plan.plant.state
     if isinstance(plan.policy, Allocation):
         asking = Plant(StateMap(plan.policy.design, reference=state.reference, frame=state.frame))
     law = no_law(state, np.zeros(len(asking.actuation.names)))
@@ -414,7 +432,8 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
             )
             law = law._replace(grid=grid)
         law = law._replace(near=x0[state.groups.q_m].copy())
-    size, slots = len(law.measured), SLOTS if noisy or plan.noise else 1
+    size = len(law.measured)
+    slots = SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
@@ -424,13 +443,16 @@ def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -
     The law commands the inputs of the plant `asking`. Along a trajectory, the law contains the
     matrices of the compensator for each sample.
     """
-    state, times, rows = asking.state, plan.times, 1
+    state = asking.state
+    times = plan.times
+    rows = 1
     loop = policy.bind(asking.robot)
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
     starts = [k * times.sample * times.dt for k in range(rows)]
     _, measures, near = zip(*map(loop.at, starts), strict=True)
-    nz, stages = len(loop.estimate), 1 if times.sample else 1 + len(plan.method.nodes)
+    nz = len(loop.estimate)
+    stages = 1 if times.sample else 1 + len(plan.method.nodes)
     terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(policy.terms, starts)]
     compensator = {
         key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
@@ -457,7 +479,8 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     The commands are for the inputs of the plant `asking`. The simulated robot is the robot of
     `plant`, and has the kernel parameters `giving`.
     """
-    asks, size = mechanics_of(asking), plant.state.nx // 2
+    asks = mechanics_of(asking)
+    size = plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
     inputs = max(len(robot.actuation.names) for robot in (asking, plant))
     point = empty(forward.POINT)._replace(q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs))
@@ -480,7 +503,9 @@ def _path(
     """
     motion, schedule = policy.trajectory, policy.schedule
     shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
-    q, u, held = list(motion.q), list(motion.u), [each.start for each in motion.actuation.held]
+    q = list(motion.q)
+    u = list(motion.u)
+    held = [each.start for each in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     pieces = schedule.K if schedule.dt else schedule.pieces
     pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)

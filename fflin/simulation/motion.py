@@ -289,13 +289,18 @@ class Motion(StatesAndInputs, Design):
             )
         first = parts[0]
         whole: Motion = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
-        robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
+        robot = whole._robot
+        q = whole.q[-1]
+        v = whole.v[-1]
+        event = ""
         for part in parts[1:]:
             if isinstance(part, Impact):
                 name, (other, *first_row) = part.event, part._before
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")
-                name, other, first_row = event or part.robot, part._robot, [part.q[0], part.v[0]]
+                name = event or part.robot
+                other = part._robot
+                first_row = [part.q[0], part.v[0]]
             seen, rates = _seen(robot, other, q, *(each[None] for each in first_row))
             apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
             if apart.max() > _MET * max(1.0, np.abs(v).max()):
@@ -309,7 +314,10 @@ class Motion(StatesAndInputs, Design):
                 robot, q, v, event = part.robot, part.q, part.v, part.event
                 whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
             else:
-                robot, q, v, event = other, part.q[-1], part.v[-1], ""
+                robot = other
+                q = part.q[-1]
+                v = part.v[-1]
+                event = ""
                 whole = _longer(whole, part, name)
         return whole
 
@@ -416,7 +424,9 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
         )
     frame = frame_of(whole._robot, whole.frame)
     state, there = (StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion))
-    last, near, t = whole.q[-1], whole.x[-1], motion.t - motion.t[0] + whole.t[-1]
+    last = whole.q[-1]
+    near = whole.x[-1]
+    t = motion.t - motion.t[0] + whole.t[-1]
     q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:

@@ -47,14 +47,18 @@ _VANISHING = 0.1
 # Displacements of the state from which the derivatives of a policy are estimated. If both
 # displacements give the same derivatives up to the relative difference _SMOOTH, the policy is
 # differentiable.
-_DISPLACEMENTS, _SMOOTH = (1e-6, 1e-5), 0.05
+_DISPLACEMENTS = (1e-6, 1e-5)
+_SMOOTH = 0.05
 _STEEPEST = 1e100  # largest derivative of a policy [SI units] that counts as finite
 
 # A step resolves a function of time if a parabola through its values at the three stages of the
 # step is accurate to _PARABOLA times the largest value. This is compared at the fractions _BETWEEN
 # of the step, in _WINDOWS steps of the run. _TRIALS is the largest number of steps that are tried.
 # A function that jumps within a step is never resolved; it may jump at multiples of the step.
-_PARABOLA, _BETWEEN, _WINDOWS, _TRIALS = 0.02, (0.2, 0.35, 0.7, 0.85), 16, 8
+_PARABOLA = 0.02
+_BETWEEN = (0.2, 0.35, 0.7, 0.85)
+_WINDOWS = 16
+_TRIALS = 8
 
 
 class Demand(NamedTuple):
@@ -131,7 +135,8 @@ class Poles:
         state = self._main_state(pole)
         if group_of(state) in ("q_b", "r_b") and self.system == ROBOT:
             return f"the rotation of the base at {size:.3g} rad/s"
-        text, details = f"the pole at {pole.real:.3g} 1/s of the {self.system}", list[str]()
+        text = f"the pole at {pole.real:.3g} 1/s of the {self.system}"
+        details = list[str]()
         if abs(pole.imag) > 1e-6 * size:
             text = f"the mode at {size / (2.0 * math.pi):.3g} Hz of the {self.system}"
             details.append(f"damping ratio {-pole.real / size:.2g}")
@@ -259,7 +264,8 @@ class Pace:
         The unit is a power of ten of a second. If `longest` is accurate, return `longest` and an
         empty text.
         """
-        h, mode = longest, ""
+        h = longest
+        mode = ""
         while h > _SHORTEST_STEP and (demand := self.demand(h)).error > 1.0:
             mode = demand.mode()
             h = shorter(h)
@@ -358,7 +364,8 @@ def _plant_model(
     Without an orbit, the errors are about a moving reference (5.1), and B is for inputs in base
     axes. In orbit, A is zero if the base is rotated by 180 deg from the reference.
     """
-    robot, state = plant.robot.replace(outputs=[FullState()]), plant.state
+    robot = plant.robot.replace(outputs=[FullState()])
+    state = plant.state
     if not robot.orbit:
         model = Linearizer(robot, frame="local", moving=True)(q, v, _in_base_axes(plant, q, u))
         return model.A, model.B, model.state_names

@@ -202,7 +202,8 @@ class Plan:
         if goal is None:
             return self.v
         state = self.plant.state
-        names, x = state.names, goal
+        names = state.names
+        x = goal
         if isinstance(goal, LinearModel):
             names, x = goal.state_names, goal.x0
         rates = dict(zip(names, np.ravel(as_double("target", x)).tolist(), strict=False))
@@ -324,11 +325,14 @@ def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> Non
     actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
     own = getattr(policy, "initial_inputs", None)  # of C code, which contains no model
     if lin is not None and lin.input_names == actuation.names:
-        where, inputs = "at its target", lin.u0[None]
+        where = "at its target"
+        inputs = lin.u0[None]
     elif along is not None and along is policy:
-        where, inputs = "on its trajectory", along.trajectory.u_base
+        where = "on its trajectory"
+        inputs = along.trajectory.u_base
     elif own is not None:
-        where, inputs = "at its target", own[None]
+        where = "at its target"
+        inputs = own[None]
     else:
         return
     units = dict(zip(actuation.names, actuation.units, strict=True))
@@ -337,7 +341,8 @@ def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> Non
 
 def duration_of(policy: object, options: SimulationOptions) -> float:
     """Return the duration [s]; by default the duration of the followed trajectory."""
-    duration, follows = options.duration, tracking_of(policy)
+    duration = options.duration
+    follows = tracking_of(policy)
     if duration is None and follows is None:
         raise InputError("the duration is missing; give duration= in s")
     return _positive("duration", follows.duration if follows and duration is None else duration)
@@ -363,7 +368,9 @@ def step_of(
     The text is empty if the step is given or not short. A given step is shortened such that the
     duration is a whole number of steps.
     """
-    dt, mode, delay = options.dt, "", number("delay", options.delay)
+    dt = options.dt
+    mode = ""
+    delay = number("delay", options.delay)
     if dt is None:
         dt, mode = pace.step()
         if sample or delay:
@@ -382,7 +389,8 @@ def times_of(
     options: SimulationOptions, duration: float, sample: float | None, pace: Pace
 ) -> Times:
     """Derive the times of a simulation; `sample` is the sample time [s], None if continuous."""
-    every, notes = options.every, list[str]()
+    every = options.every
+    notes = list[str]()
     delay = number("delay", options.delay)
     if not 0.0 <= delay < duration:
         raise InputError(
@@ -407,7 +415,8 @@ def times_of(
         notes.append(f"the step is {dt:.3g} s, because {mode} requires it")
     notes += pace.remarks(dt)
     samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
-    thinned, part = every is None and steps > _MANY_ROWS, max(samples, 1)
+    thinned = every is None and steps > _MANY_ROWS
+    part = max(samples, 1)
     # If `every` is chosen automatically, rows of a sampled policy are recorded only at samples.
     few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
     every = few if every is None else whole("every", every, 1)
@@ -488,7 +497,8 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     and wheel angles, are ignored. The time is rounded up to a multiple of 10 s and is at least
     SHORTEST. If the loop does not settle before LONGEST, return SHORTEST.
     """
-    lin, closed = policy.lin, closed_loop(policy)
+    lin = policy.lin
+    closed = closed_loop(policy)
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
     assert closed is not None
     loop, dt = closed

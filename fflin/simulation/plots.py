@@ -119,7 +119,8 @@ def plot_motion(
         colors = dict(zip(joints, cycle(len(joints)), strict=True))
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
         for (row, column), (title, found) in zip(spots, drawn.items(), strict=False):
-            panel, group = figure.add_subplot(grid[row, column]), found[0].group
+            panel = figure.add_subplot(grid[row, column])
+            group = found[0].group
             panel.set_title(f"{title} {group}" if title in states else title)
             _draw(panel, motion.t, found, colors if group in JOINTS else {})
             if motion.tracked and [title] == states[:1]:
@@ -178,13 +179,16 @@ def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     curves are the differences from the linear prediction. If there is neither a
     reference nor a prediction, there are no curves.
     """
-    names, units, what = motion.state_names, motion.state_units, "error"
+    names = motion.state_names
+    units = motion.state_units
+    what = "error"
     if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
         sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
         e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
     elif motion.linear is not None:
-        what, e = "difference", motion.x - motion.linear
+        what = "difference"
+        e = motion.x - motion.linear
     else:
         return what, {}
     of, none = zip(names, units, e.T, strict=True), np.zeros(0)

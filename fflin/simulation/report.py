@@ -165,9 +165,11 @@ def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
             continue
         size, (low, high) = max(map(abs, curve.levels)), curve.limits
         excess = np.maximum(low - curve.values, curve.values - high)
-        beyond, at = excess > max(_SHARE * size, 1e-12), int(excess.argmax())
+        beyond = excess > max(_SHARE * size, 1e-12)
+        at = int(excess.argmax())
         if beyond[at]:
-            value, first = float(curve.values[at]), curve.group == "q_m" and bool(beyond[0])
+            value = float(curve.values[at])
+            first = curve.group == "q_m" and bool(beyond[0])
             limit = float(high if value > high else low)
             one = Passed(curve.name, value, float(t[at]), limit, curve.unit, first)
             worst.append((-excess[at] / (size or 1e-12), one))
@@ -320,7 +322,9 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
     """
     if motion.error is None or motion.attitude_error is None:
         return []
-    steered, sizes, found = set(motion.steered or motion.state_names), np.abs(motion.error), []
+    steered = set(motion.steered or motion.state_names)
+    sizes = np.abs(motion.error)
+    found = []
     kinds: dict[tuple[str, str], list[int]] = {}
     for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
         group, _, entry = name.partition(".")
@@ -348,7 +352,8 @@ def _tail(size: Array) -> str:
     # The last two windows are compared by their largest errors, so that an oscillation about a
     # constant error counts as one that remains.
     rows = max(int(_TAIL * len(size)), 1)
-    last, before = size[-rows:], size[-2 * rows : -rows].max(initial=0.0)
+    last = size[-rows:]
+    before = size[-2 * rows : -rows].max(initial=0.0)
     if last.max() <= max(_SEEN * size.max(), THERE):
         return ""
     if last.max() > _GROWS * before and last.min() >= before:
@@ -363,7 +368,8 @@ def pushed(of: object) -> bool:
 
 def motion_report(motion: Motion) -> str:
     """Return a text about settling, inputs, limit violations and conserved quantities."""
-    kinds, t = error_sizes(motion), motion.t
+    kinds = error_sizes(motion)
+    t = motion.t
     heads = [verdict(motion, kinds) if kinds or motion.stopped else "", _fast_wheels(motion)]
     head = ["; ".join(filter(None, heads))] if any(heads) else []
     by = ", compiled" if motion.engine == "compiled" else ""
@@ -412,7 +418,8 @@ def motion_report(motion: Motion) -> str:
 
 def motion_record(motion: Motion) -> dict[str, object]:
     """Return the values of the report as {name: value}, for --json."""
-    t, own = motion.t, ["stopped", "frame", "engine", "step", "saturated", "notes"]
+    t = motion.t
+    own = ["stopped", "frame", "engine", "step", "saturated", "notes"]
     own += ["state_names", "state_units", "input_names", "input_units"]
     errors = error_sizes(motion)
     # The errors of revolute and of prismatic joints have the same title but different units. For a
@@ -520,7 +527,8 @@ def _largest_modes(motion: Motion) -> str:
     far = []
     for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):
         at = motion.state_names.index(f"q_m.{name}")
-        size, unit = np.abs(motion.x[:, at]), motion.state_units[at]
+        size = np.abs(motion.x[:, at])
+        unit = motion.state_units[at]
         degrees = float(np.degrees(rotation * size.max()))
         rows.append([name, unit, *_cells(size.max(), degrees), f"{motion.t[size.argmax()]:.3g}"])
         if degrees > _LINEAR and unit == _MODAL:

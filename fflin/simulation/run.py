@@ -81,7 +81,8 @@ class Plant(Aba):
         super().__init__(state)
         self.disturbance = disturbance
         self._warned = False  # whether a warning of the order of a disturbance was given
-        nu, groups = len(self.actuation.names), self.actuation.groups
+        nu = len(self.actuation.names)
+        groups = self.actuation.groups
         # Indices in u at which the base torque and the base force begin, if they are inputs.
         self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
         self.faults = faults or ActuatorFaults(
@@ -141,7 +142,8 @@ class Plant(Aba):
     def disturbing(self, t: float, q: Array, v: Array) -> Array:
         """Return the generalised force (nv,) of the disturbance, or raise `InputError`."""
         assert self.disturbance is not None
-        name, given = f"at t = {t:g} s, disturbance(t, q, v)", self.disturbance
+        name = f"at t = {t:g} s, disturbance(t, q, v)"
+        given = self.disturbance
         forces = given if isinstance(given, Mapping) else given(t, q.copy(), v.copy())
         if isinstance(forces, Mapping):
             return self._named_force(forces, q)
@@ -212,8 +214,11 @@ class Conserved:
     # momentum about the origin would have large rounding errors.
 
     def __init__(self, plan: Plan) -> None:
-        robot, start = plan.plant.robot, plan.q[:3]
-        self._robot, self._model, self.mass = robot, robot.model, robot.mass
+        robot = plan.plant.robot
+        start = plan.q[:3]
+        self._robot = robot
+        self._model = robot.model
+        self.mass = robot.mass
         self._field, self._stored = plan.plant.field, robot.stored_momentum
         self._data = data = robot.create_data()
         self._M = data.M[:6]  # CRBA writes into this array
@@ -237,7 +242,8 @@ class Conserved:
         # exactly zero.
         method, h = plan.method, plan.times.dt
         self._stack = np.zeros((2 + len(method.weights), 6))
-        self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
+        self._sums = self._stack[:2]
+        self.wrenches = tuple(self._stack[2:])
         weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
         self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
@@ -315,7 +321,9 @@ class Conserved:
         integral and five zeros. The bounds are replaced by the size of the largest terms of the
         Jacobi integral and a zero.
         """
-        robot, rows, near = self._robot, len(q), q.copy()
+        robot = self._robot
+        rows = len(q)
+        near = q.copy()
         near[:, :7] -= self._start
         energy, momentum, center, polar = integrals(robot, near, v)
         sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
@@ -377,25 +385,57 @@ def _follower(plan: Plan) -> Callable[[int], None] | None:
     return lambda stages: advance(weights[stages - 1, : stages + 1], stages == len(weights))
 
 
+class _Rows:
+    """Rows that a run in Python records, with the momentum and the centre of mass of each row."""
+
+    def __init__(self, plan: Plan, kept: Conserved) -> None:
+        self.times = list[float]()
+        self._kept = kept
+        self._callback = plan.options.callback
+        self._ends = np.cumsum([len(plan.q), len(plan.v), len(plan.initial), 6])
+        self._rows = np.empty((plan.times.rows, self._ends[-1] + 3))
+
+    def add(self, t: float, q: Array, v: Array, u: Array) -> None:
+        """Record a row, and call the callback of the run."""
+        kept = self._kept
+        row = np.concatenate((q, v, u, kept.momentum, kept.center(t)))
+        self._rows[len(self.times)] = row
+        self.times.append(t)
+        if self._callback:
+            self._callback(t, q.copy(), v.copy(), u.copy())
+
+    def recording(self, steps: int, stopped: str) -> Recording:
+        """Return the rows of a run that ended after `steps` for the reason `stopped`."""
+        parts = np.split(self._rows[: len(self.times)], self._ends, axis=1)
+        q, v, u, momentum, center = parts
+        return Recording(
+            t=np.array(self.times),
+            q=q,
+            v=v,
+            u=u,
+            momentum=momentum,
+            center=center,
+            steps=steps,
+            stopped=stopped,
+            engine="python",
+        )
+
+
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
     """Simulate a plan in Python; the progress bar of a long run shows the text `hint`."""
     plant, times, law, q, v = plan.plant, plan.times, plan.law, plan.q, plan.v
-    dt, kept, callback = times.dt, Conserved(plan), plan.options.callback
+    dt = times.dt
+    kept = Conserved(plan)
     applied = None if law is None else plan.applied(law, lambda t, q, v: v[plan.wheels])
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage = plan.method(plant.robot.model, dt).step, plant.stage
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
-    ends = np.cumsum([len(q), len(v), len(plan.initial), 6])
-    rows, at, t, stages = np.empty((times.rows, ends[-1] + 3)), list[float](), 0.0, 0
-
-    def record() -> None:
-        rows[len(at)] = np.concatenate((q, v, u, kept.momentum, kept.center(t)))
-        at.append(t)
-        if callback:
-            callback(t, q.copy(), v.copy(), u.copy())
+    rows = _Rows(plan, kept)
+    t = 0.0
+    stages = 0
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
         nonlocal stages
@@ -414,8 +454,9 @@ def go(plan: Plan, hint: str = "") -> Recording:
         for step in range(times.steps):
             u = applied(step, t, q, v) if applied else plan.initial
             if step % times.every == 0:
-                record()
-            stages, last = 0, t + plan.last_node * dt
+                rows.add(t, q, v, u)
+            stages = 0
+            last = t + plan.last_node * dt
             plant.step = (t, dt)
             q, v = take(acceleration, t, q, v)
             if pushed:
@@ -428,15 +469,14 @@ def go(plan: Plan, hint: str = "") -> Recording:
             if step % _LOOK == 0:
                 bar(step + 1, times.steps, hint=hint)
     except KeyboardInterrupt:
-        if not at:
+        if not rows.times:
             raise
         stopped = f"interrupted at t = {step * dt:g} s"
     finally:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
-        record()
-    q_of, v_of, u_of, momentum, center = np.split(rows[: len(at)], ends, axis=1)
-    return Recording(np.array(at), q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
+        rows.add(t, q, v, u)
+    return rows.recording(step + 1, stopped)
 
 
 def stop_conditions(plan: Plan) -> StopConditions:
@@ -479,7 +519,8 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
             return ""
         if goes_on(anywhere, origin, place, rates):
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
-        dt, turn = plan.times.dt, float(np.abs(v[plan.plant.turning]).max()) * plan.times.dt
+        dt = plan.times.dt
+        turn = float(np.abs(v[plan.plant.turning]).max()) * plan.times.dt
         detail = f": a joint or the base rotates by {turn:.2g} rad per step"
         known = LARGEST_TURN <= turn <= _LARGEST_SHOWN
         return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"

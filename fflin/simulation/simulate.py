@@ -232,7 +232,8 @@ def simulate(
     (9, 5.0)
     """
     plan = Plan(SimulationOptions(**locals()))
-    foresees, compiled = predictor(plan), engine_of(engine, plan) == "compiled"
+    foresees = predictor(plan)
+    compiled = engine_of(engine, plan) == "compiled"
     hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
     began = perf_counter()
     try:
@@ -400,7 +401,8 @@ def predictor(plan: Plan) -> Predictor | None:
         return None
     if lin is not None and lin.state_names == state.names:
         if isinstance(policy, LinearController) and policy.dt:
-            by, model = policy.terms(), lin
+            by = policy.terms()
+            model = lin
             z: Array = np.zeros(len(by.A))
 
             def command(e: Array) -> Array:

@@ -73,8 +73,11 @@ class ModelDerivatives:
         reference = None if own else lin.reference
         self._prepare = partial(Prepared, frame=lin.frame, reference=reference, moving=lin.moving)
         self._ready = self._prepare(robot)
-        state, actuation, data = self._ready.map, self._ready.actuation, robot.create_data()
-        self._state, self._data = state, robot.create_data()
+        state = self._ready.map
+        actuation = self._ready.actuation
+        data = robot.create_data()
+        self._state = state
+        self._data = robot.create_data()
         self._chart = Standing() if own else state.chart(lin.q)
         self._u, self._nu = actuation.in_base_axes(self._chart, lin.u0), state.velocities(lin.v)
         nv, nu = len(self._nu), len(self._u)
@@ -96,7 +99,10 @@ class ModelDerivatives:
         # Row i of `rates` belongs to parameter i. An additional last row contains zeros. `assemble`
         # is an affine function of `rates`. For the row of zeros, it returns the constant part of
         # A, B and f0. This constant part is subtracted below.
-        state, ready, count, nv = self._state, self._ready, len(parameters) + 1, len(self._nu)
+        state = self._state
+        ready = self._ready
+        count = len(parameters) + 1
+        nv = len(self._nu)
         A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
         rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
@@ -139,7 +145,8 @@ class ModelDerivatives:
         ready = self._prepare(other)
         sensing, actuation = ready.sensing, ready.actuation
         assert sensing is not None
-        data, point = other.create_data(), (lin.q, lin.v, self._nu, self._u)
+        data = other.create_data()
+        point = (lin.q, lin.v, self._nu, self._u)
 
         def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:
             change_bodies(other.model, self.robot.model, one, size)
@@ -167,7 +174,8 @@ class ModelDerivatives:
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
                 "checked, for example 'base.mass'"
             )
-        lin, step = self.lin, _STEP / self.fraction(one.bodies)
+        lin = self.lin
+        step = _STEP / self.fraction(one.bodies)
 
         def at(times: float) -> tuple[Array, Array]:
             model = self.robot.model.copy()
@@ -274,7 +282,8 @@ class ModelDerivatives:
 
         RNEA is computed for the accelerations `c` and the external wrenches `pushed`.
         """
-        model, at_rest = self.robot.model, np.zeros_like(self._v)
+        model = self.robot.model
+        at_rest = np.zeros_like(self._v)
         given = (self._q, at_rest, self._state.spread(c))
         more = () if pushed is None else (pushed,)
         by_q = pin.computeRNEADerivatives(model, self._data, *given, *more)[0]
@@ -286,7 +295,9 @@ class ModelDerivatives:
         `_rates` contains the accelerations and their derivatives with respect to state and inputs.
         The parameter changes a spring, a damper or the wrench of an input.
         """
-        state, u, size = self._state, self._u, len(self._inverse)
+        state = self._state
+        u = self._u
+        size = len(self._inverse)
         F: Array = np.zeros(size)
         B = np.zeros_like(self._rates.by_u)
         F_q: Array = np.zeros((size, size - 6))

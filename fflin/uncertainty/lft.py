@@ -116,7 +116,8 @@ class LFT(Design):
         for name, unit, middle, half, repeats in zip(*columns, strict=True):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
-        many, count = counted(len(self.repeats), "parameter"), f"{self.repeats.sum():g}"
+        many = counted(len(self.repeats), "parameter")
+        count = f"{self.repeats.sum():g}"
         said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
         return f"{folded([said])}\n\n{grid(cut(rows), 'll')}"
 
@@ -287,7 +288,9 @@ class _Form:
     """
 
     def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
-        state, robot, data = ready.map, ready.robot, ready.robot.create_data()
+        state = ready.map
+        robot = ready.robot
+        data = ready.robot.create_data()
         self.state, self.ranges = state, ranges
         centred = lin.q.copy()  # with the base at the origin
         centred[:3] = 0.0
@@ -308,7 +311,8 @@ class _Form:
         # motion, this sum is zero.
         self.force = np.zeros((nv, self.ends[-1]))
         by_a, by_x, by_u, _ = self.parts(self.force)
-        by_a[:], by_u[:] = lin.M, -columns
+        by_a[:] = lin.M
+        by_u[:] = -columns
         by_x[6:, state.groups.q_m] = np.diag(robot.springs.stiffness)
         by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
 
@@ -339,7 +343,8 @@ class _Form:
                 left, sizes, right = np.linalg.svd(cross)
                 shifts.append((at, left[:, :2] * sizes[:2], right[:2]))
         D = np.zeros((6, 6))
-        D[:3, :3], D[3:, 3:] = piece.mass * np.eye(3), piece.inertia
+        D[:3, :3] = piece.mass * np.eye(3)
+        D[3:, 3:] = piece.inertia
         now = J @ self.a
         s = now.copy()
         for at, left, right in shifts:  # a centre of mass shifted by d: v' = v + omega x d
@@ -393,7 +398,8 @@ class _Form:
         x is the amplitude of the mode, and I its inertia. The frequency omega and the damping ratio
         zeta of the mode can be uncertain.
         """
-        joint, springs = self.state.robot.joints[index], self.state.robot.springs
+        joint = self.state.robot.joints[index]
+        springs = self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]
         omega, ratio = joint.oscillation(K, D)
         position, rate = self.x[[6 + index]], self.x[[self.state.groups.qdot_m.start + index]]

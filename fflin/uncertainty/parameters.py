@@ -58,7 +58,9 @@ class Parameters(dict[str, Parameter]):
     """Parameters of a robot by name; a body of one link can be named by its link or joint."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self.pieces, self._link_of = robot, robot.pieces, robot.link_of
+        self._robot = robot
+        self.pieces = robot.pieces
+        self._link_of = robot.link_of
         self._sums = robot._sums
         of_pieces = (each for item in self.pieces.items() for each in _of_piece(*item))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
@@ -106,7 +108,9 @@ class Parameters(dict[str, Parameter]):
 
     def robot(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with {parameter: value}; raise `InputError` if it is not realisable."""
-        nominal, bodies, parts = self._robot, self._bodies(values), self._by_owner(values)
+        nominal = self._robot
+        bodies = self._bodies(values)
+        parts = self._by_owner(values)
         robot = nominal.with_bodies(bodies) if bodies else nominal
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
@@ -148,7 +152,8 @@ class Parameters(dict[str, Parameter]):
         model, bare = self._robot.model, self._robot._bare.model
         found: dict[int, Array] = {}
         for name, parts in self._by_owner(values).items():
-            own, piece = {*parts} & OF_PIECES, self.pieces.get(name)
+            own = {*parts} & OF_PIECES
+            piece = self.pieces.get(name)
             if piece is None or not own:
                 continue
             com, inertia = piece.frame.actInv(piece.placement.translation), piece.inertia.copy()
@@ -232,7 +237,8 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
     at = 0
     for item, names in robot.named_inputs:
-        first, at = at, at + len(names)
+        first = at
+        at = at + len(names)
         if isinstance(item, Thruster):
             joint, placement = find_frame(robot.model, item.frame)
             where, along = np.array(item.position), np.array(item.direction)

@@ -238,7 +238,8 @@ class Sensitivity:
         """
         instance("only", only, (str, type(None)), "the name of a kind, a link or a pattern")
         shown = self.parameters.ranked(only)
-        lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
+        lin = self.lin
+        sizes = [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
         rows = []
         for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
             small = one.part.partition(".")[0] in ("com", "position")

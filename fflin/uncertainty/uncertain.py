@@ -87,7 +87,8 @@ class Uncertain:
             fixed point for all values of the parameters. The operating point can depend on the
             parameters because of gravity, an orbit, stored momentum or a deflected spring.
         """
-        robot, lin = self.robot, linearize(self.robot, q)
+        robot = self.robot
+        lin = linearize(self.robot, q)
         if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in robot.outputs):
             raise InputError(
                 "an output depends on accelerations or masses, which the LFT cannot represent; "
@@ -118,7 +119,8 @@ class Uncertain:
         InputError
             If the inertia of a body with these parameters is not physically realisable.
         """
-        known, found = self._parameters, dict[str, float]()
+        known = self._parameters
+        found = dict[str, float]()
         blocks = {each.name: each for each in self.blocks if each.name not in known}
         for key, value in numbers("values", values, "parameter", "value").items():
             if key in blocks:
@@ -141,7 +143,8 @@ class Uncertain:
         """
         wanted = count("n", n)
         draw = np.random.default_rng(whole("seed", seed, 0))
-        found, lost = list[Array](), 0
+        found = list[Array]()
+        lost = 0
         while len(found) < wanted:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
             if not (why := self.refusal(delta)):

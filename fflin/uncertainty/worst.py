@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 _CORNERS = 256
 # Largest number of steps of a local search, and trial lengths of a step relative to half a range.
 # Steps are cut off at the ends of the ranges, so the length 1e9 leads to a corner of the set.
-_STEPS, _LENGTHS = 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
+_STEPS = 25
+_LENGTHS = np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
 # In each step, the exact criterion is computed for the _HELD trial points with the largest quick
 # criterion. The quick criterion of a gain uses at most _FREQUENCIES frequencies. Gradients are
 # finite differences with the step _DIFFERENCE.
@@ -142,7 +143,8 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
-    found, bar = [], Progress()
+    found = []
+    bar = Progress()
     undamped = Figures(loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b)
     for figures in (undamped, loops.figures(disk), loops.figures(whole)):
         value, delta = _largest(figures, tried, of.refusal)
@@ -288,7 +290,9 @@ def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> 
     A step follows the gradient, or sets one delta to -1 or 1.
     """
     quick, exact, _ = figures
-    value, delta, unit = float(exact(start[None])[0]), start, np.eye(len(start))
+    value = float(exact(start[None])[0])
+    delta = start
+    unit = np.eye(len(start))
     for _ in range(_STEPS):
         if not np.isfinite(value):
             break
@@ -311,7 +315,8 @@ def _safe(loops: Loops) -> float:
 
     If all ranges are scaled by less than the returned factor, all loops are stable.
     """
-    lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
+    lft = loops.lft
+    F = loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
     def response(w: Array) -> Array:

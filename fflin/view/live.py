@@ -62,9 +62,12 @@ class Live:
         self._lock = threading.Lock()
         # Clock time and simulation time [s] at the first shown step of a simulation.
         self._began: tuple[float, float] | None = None
-        self._state, self._clients = "{}", set[_Socket]()
-        self._page, page.window.forward = page, partial(self._each, _Socket.send)
-        self.meshcat, self.notes = page.meshcat, tuple(page.notes)
+        self._state = "{}"
+        self._clients = set[_Socket]()
+        self._page = page
+        page.window.forward = partial(self._each, _Socket.send)
+        self.meshcat = page.meshcat
+        self.notes = tuple(page.notes)
         axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         sliders = [
             {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
@@ -132,7 +135,8 @@ class Live:
                 "joints": [self.robot.joint(name).value(q) for name in self._ranges],
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
-            self.q, self._state = q, json.dumps(state)
+            self.q = q
+            self._state = json.dumps(state)
         # A slow browser receives only the newest state, and skips the older states.
         self._each(_Socket.update)
 

@@ -94,7 +94,8 @@ def body_poses(robot: Robot, q: Array) -> Array:
     The pose of a body is the pose of its joint's frame. The body of the first mode of a flexible
     appendage is an exception: its pose is the pose of the appendage's frame after bending.
     """
-    data, found = robot.model.createData(), []
+    data = robot.model.createData()
+    found = []
     for row in q.reshape(-1, robot.nq):
         pin.forwardKinematics(robot.model, data, row)
         poses = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]]
@@ -114,7 +115,8 @@ class Drawing:
     def __init__(
         self, page: Page, robot: Robot, node: str, look: str = "real", prefix: str = ""
     ) -> None:
-        self.prefix, self._visualizer = prefix, page.meshcat[node]
+        self.prefix = prefix
+        self._visualizer = page.meshcat[node]
         # Name of each body's node, in the order of Pinocchio's joints (without the universe).
         self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
         found, notes = shapes(robot)
@@ -217,7 +219,8 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
             (_triangles(mesh), scale, shape.color or mesh.color or PLAIN, _bounds(mesh.vertices))
             for mesh in load_mesh(shape.mesh)
         ]
-    color, found = shape.color or PLAIN, list[tuple[dict[str, object], Array, Color, Array]]()
+    color = shape.color or PLAIN
+    found = list[tuple[dict[str, object], Array, Color, Array]]()
 
     def add(name: str, matrix: Array, half: Sequence[float], **sizes: float) -> None:
         geometry = {"uuid": name.lower(), "type": f"{name}Geometry", **sizes}
@@ -228,7 +231,8 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
         half = [side / 2.0 for side in shape.size]
         add("Box", unit, half, width=width, height=height, depth=depth)
         return found
-    radius, ends = shape.size[0], [0.0]
+    radius = shape.size[0]
+    ends = [0.0]
     if shape.kind != "sphere":
         length = shape.size[1]
         sizes = {"radiusTop": radius, "radiusBottom": radius, "height": length}
@@ -286,7 +290,8 @@ class Recorder:
 
     def record(self, lowered: Lowered) -> None:
         """Record and forward a command that is already in the form of a dictionary."""
-        kind, path = lowered["type"], lowered.get("path", "")
+        kind = lowered["type"]
+        path = lowered.get("path", "")
         # The browser ignores empty parts of a path.
         path = "/" + "/".join(part for part in path.split("/") if part)
         if kind == "delete":
@@ -366,7 +371,9 @@ class Page:
 
         `entries` are added to the data that the scripts of the page read.
         """
-        robot, nodes, orbit = self.robot, self.nodes, dict[str, object]()
+        robot = self.robot
+        nodes = self.nodes
+        orbit = dict[str, object]()
         if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
             # The rows of "up" are the axes of the page in the orbital frame: x along the orbit, y
@@ -385,7 +392,8 @@ class Page:
         named, wheels = named_wheels(robot.inputs), list[dict[str, object]]()
         for name, wheel in named:
             joint, at = find_frame(robot.model, wheel.frame)
-            axis, several = np.array(wheel.axis), [each.frame for _, each in named]
+            axis = np.array(wheel.axis)
+            several = [each.frame for _, each in named]
             apart = _APART * self.size * (several.count(wheel.frame) > 1)
             placement = at * pin.SE3(turned_to(axis), apart * axis)
             # If the speed of a wheel is a state, the drawn wheel rotates with the node of the
@@ -394,7 +402,8 @@ class Page:
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         # A live page receives the meshcat commands from the server. Other pages contain these
         # commands and open no connection.
-        live, digits = mode == "live", max(4, 4 - math.floor(math.log10(self.size)))
+        live = mode == "live"
+        digits = max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **orbit,
             "triads": triads,

@@ -62,9 +62,11 @@ def motion_page(
     page: Page, motion: Motion, fps: float, speed: float, follow: bool | None, target: Array | None
 ) -> str:
     """Return the page of a motion; see `visualize`."""
-    robot, shown = page.robot, frame_indices(motion.t, fps, speed)
+    robot = page.robot
+    shown = frame_indices(motion.t, fps, speed)
     frame = frame_of(robot, motion.frame)
-    t, state = motion.t[shown], StateMap(robot, reference=motion.reference, frame=frame)
+    t = motion.t[shown]
+    state = StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
     if target is None:
         # At the end, `states` has one row for a fixed target, one row per frame for a moving
@@ -150,7 +152,8 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and the
     trails of the target are included.
     """
-    trails, followed = {"centre of mass": film.com}, dict[str, Array]()
+    trails = {"centre of mass": film.com}
+    followed = dict[str, Array]()
     if len(goals) > 1:
         trails, followed = {"base": film.poses[:, 0, :3]}, {"base": goals[:, 0, :3]}
     if page.tool:
@@ -203,7 +206,9 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
 
     The wrenches on the base are converted from the frame of `state` to world axes.
     """
-    robot, data, groups = state.robot, state.robot.create_data(), Actuation(state).groups
+    robot = state.robot
+    data = state.robot.create_data()
+    groups = Actuation(state).groups
     poses = body_poses(robot, q)
     com = np.array([pin.centerOfMass(robot.model, data, row).copy() for row in q])
     turned = rotation_matrices(poses[:, 0, 3:])
@@ -245,7 +250,11 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     """
     payload = caught.payload.replace(damping=0.0)
     state = StateMap(payload, frame=frame)
-    q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
+    q = caught.payload_q
+    v = caught.payload_v
+    plant = Plant(state)
+    now = 0.0
+    poses = list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
     rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of frequencies
@@ -261,7 +270,8 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
 
 def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
     """Return the poses of a captured payload at configurations (N, nq) of the combined robot."""
-    model, data = robot.model, robot.model.createData()
+    model = robot.model
+    data = robot.model.createData()
     places = carriers_of(robot, caught.prefix, caught.payload)
     poses = []
     for q in rows:
@@ -403,7 +413,8 @@ def mode_page(
 
 def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
     """Return the poses (_PHASES, njoints - 1, 7) of a mode's oscillation over one period."""
-    robot, half = state.robot, len(lin.x0) // 2
+    robot = state.robot
+    half = len(lin.x0) // 2
 
     def poses(amplitude: float) -> Array:
         x = np.repeat(lin.x0[None], _PHASES, axis=0)

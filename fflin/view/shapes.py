@@ -75,7 +75,9 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
         carriers = carriers_of(robot, prefix, other)
         for shape in theirs:
             joint, held = carriers[shape.joint - ROOT]
-            placement, link, at = held * shape.placement, f"{prefix}.{shape.link}", held * shape.at
+            placement = held * shape.placement
+            link = f"{prefix}.{shape.link}"
+            at = held * shape.at
             found.append(replace(shape, joint=joint, placement=placement, link=link, at=at))
     return tuple(found), tuple(notes)
 
@@ -258,7 +260,8 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     found: dict[str, Bending] = {}
     for item in robot.appendages:
         if isinstance(item, FlexibleAppendage) and item.frame in carried:  # excludes the root link
-            bending, links = bendings(robot)[item.title], [item.frame]
+            bending = bendings(robot)[item.title]
+            links = [item.frame]
             for link in links:
                 if robot.model.existFrame(link) and (
                     find_frame(robot.model, link).joint == bending.carrier

@@ -194,7 +194,8 @@ def visualize(
         goal = None if target is None else _configuration(robot, "target", target)
         page = Page(robot, motion.q[0], scene, tool, motion.frame)
         found = motion_page(page, motion, fps, speed, follow, goal)
-        contents, notes = _pictures(found, outputs, motion, speed, times), page.notes
+        contents = _pictures(found, outputs, motion, speed, times)
+        notes = page.notes
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)

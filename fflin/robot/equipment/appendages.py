@@ -95,7 +95,8 @@ class FlexibleAppendage(FrozenArrays):
         _check_names(self.frame, self.name)
         what = f"flexible appendage '{self.frame}'"
         frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
-        damping, modes = as_double(f"damping of {what}", self.damping), frequency.size
+        damping = as_double(f"damping of {what}", self.damping)
+        modes = frequency.size
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
                 f"frequency and damping of {what} have shapes {frequency.shape} and "
@@ -223,7 +224,8 @@ class FlexibleAppendage(FrozenArrays):
         modes = zip(self.modes, self.frequency, self.damping, squares, strict=True)
         for mode, f, ratio, sizes in modes:
             rows.append([mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)])
-        sums, head = squares.sum(axis=0), f"{self.title}: clamped at frame '{self.frame}'"
+        sums = squares.sum(axis=0)
+        head = f"{self.title}: clamped at frame '{self.frame}'"
         totals = {"all modes": sums}
         if self.inertia is not None:
             rigid, body = self.inertia.diagonal(), rigid_inertia(self.inertia)
@@ -387,7 +389,8 @@ class Slosh:
         omega = math.sqrt(acceleration * k * math.tanh(k * height))
         at = height - 2.0 / k * math.tanh(0.5 * k * height)
         center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
-        position, frequency = tuple(center.tolist()), omega / (2.0 * math.pi)
+        position = tuple(center.tolist())
+        frequency = omega / (2.0 * math.pi)
         length = acceleration / omega**2 if truth("pendulum", pendulum) else None
         return cls(frame, share * liquid, position, frequency, length, along, damping, name)
 

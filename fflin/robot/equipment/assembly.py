@@ -85,7 +85,8 @@ def equipped(
     the robot keeps the old value. Each mode becomes a joint, and so does each wheel with an
     inertia. If a joint no longer exists, its entries are removed from fields such as `stiffness`.
     """
-    before, bare = robot._bare, bare or robot._bare
+    before = robot._bare
+    bare = bare or robot._bare
     checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
     model, joints, followers = bare.model, bare.joints, bare.followers
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
@@ -147,17 +148,22 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     given = [appendages] if isinstance(appendages, Appendage) else appendages
     if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
         raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
-    bare, taken = robot._bare, set[int]()
+    bare = robot._bare
+    taken = set[int]()
     for item in given:
         if not isinstance(item, FlexibleAppendage) or item.inertia is None:
             continue
         # The inertia `of_file` is compared with the inertia `own`, or replaces it. `own` belongs to
         # the link `item.frame`, or to the whole body if this frame is not a link.
         joint, placement = find_frame(bare.model, item.frame)
-        body, what = bare.model.inertias[joint], f"the body with frame '{item.frame}'"
-        of_file, own, links = rigid_inertia(item.inertia), body, bare.links
+        body = bare.model.inertias[joint]
+        what = f"the body with frame '{item.frame}'"
+        of_file = rigid_inertia(item.inertia)
+        own = body
+        links = bare.links
         if item.frame in bare.pieces:
-            own, what = as_inertia(bare.pieces[item.frame]), f"link '{item.frame}'"
+            own = as_inertia(bare.pieces[item.frame])
+            what = f"link '{item.frame}'"
         if not item.rigid:
             _compare_inertia(item, item.inertia, own.se3Action(placement.inverse()), what)
             continue
@@ -215,7 +221,9 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
     carry_over(model, new)
     for name, body in zip(model.names, bodies, strict=True):
         new.inertias[new.getJointId(name)] = body
-    new.name, new.gravity, armature = model.name, model.gravity, new.armature.copy()
+    new.name = model.name
+    new.gravity = model.gravity
+    armature = new.armature.copy()
     for part in parts:
         index = new.getJointId(part.joint.name)
         new.inertias[index], armature[new.idx_vs[index]] = part.inertia, part.armature
@@ -232,7 +240,8 @@ def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dic
     marked, names = model.copy(), dict[str, str]()
     for index, frame in enumerate(marked.frames):
         if index and frame.type != pin.FrameType.JOINT:
-            names[f"\0{mark}.{index}"], frame.name = frame.name, f"\0{mark}.{index}"
+            names[f"\0{mark}.{index}"] = frame.name
+            frame.name = f"\0{mark}.{index}"
     return marked, names
 
 
@@ -343,7 +352,8 @@ def _mounted_modes(
         joint, placement, L = _carried(model, item)
         of_body.setdefault(joint, []).append((item, placement, L))
     for joint, items in of_body.items():
-        body, L = bodies[joint], np.hstack([L for _, _, L in items])
+        body = bodies[joint]
+        L = np.hstack([L for _, _, L in items])
         rows = np.array([body.mass]), body.lever[None], body.inertia[None]
         names = [name for item, _, _ in items for name in item.modes]
         for k, mode in enumerate(names, start=1):
@@ -537,10 +547,13 @@ def _at_ball(column: Column) -> _AtBall:
         center = sigma * np.cross(t, r) / square
         across = (1.0 - sigma) * across
     else:
-        a, t = 0.0, zero
+        a = 0.0
+        t = zero
     b = _square_over(along + across, column.moment)
     if b <= _NONE:
-        b, along, across = 0.0, zero, zero
+        b = 0.0
+        along = zero
+        across = zero
     return _AtBall(center, t, along, across, a + b)
 
 
@@ -557,7 +570,8 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     the mass mu in (16.5). If `lighter` is 1, the joint needs no rotor inertia.
     """
     at = _at_ball(column)
-    t, r = at.t, at.along + at.across
+    t = at.t
+    r = at.along + at.across
     mass = at.fraction * column.mass
     moment = at.fraction * column.moment if r.any() else 0.0
     v, w = t / (mass or 1.0), r / (moment or 1.0)
@@ -576,13 +590,15 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     scale = 1.0
     offset: Array = np.zeros(3)  # from the ball to the joint axis
     if turning:
-        axis, scale = w / turning, turning
+        axis = w / turning
+        scale = turning
         pitch = float(v @ w) / turning**2
         # w x v / |w|^2, where only the part of w across v counts. It is exactly 0 for sigma = 1.
         offset = np.cross(at.across, v) / (moment * turning**2)
         motion = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
     elif moving:
-        axis, scale = v / moving, moving
+        axis = v / moving
+        scale = moving
     # The modal mass of 1 is the sum of S^T I S, which is t @ v + r @ w, and of the rotor inertia
     # `rotor`. If the mass of the ball is less than mu in (16.5), S^T I S exceeds 1, and `rotor` is
     # negative. If the participation is zero, S = 0 and `rotor` = 1.
@@ -603,7 +619,8 @@ def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
     first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
-    inertia, rotation = slosh.modal_mass, float(not slides)
+    inertia = slosh.modal_mass
+    rotation = float(not slides)
     across = [
         Joint(name, prismatic=slides, kind="slosh", inertia=inertia, rotation=rotation)
         for name in slosh.modes

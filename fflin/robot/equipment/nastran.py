@@ -65,7 +65,8 @@ def read_superelement(
     require_regular(path, ".op4", _LARGEST_OP4)
     boundary, rigid, points = _boundary(assembly)
     M, K = _matrices(path, len(boundary))
-    inner, rigid = ~boundary, rigid[boundary]
+    inner = ~boundary
+    rigid = rigid[boundary]
     center = points.mean(axis=0)
     if origin is not None:
         center = vector("origin", origin, 3, "a point") / LENGTHS[length]

@@ -164,7 +164,8 @@ def read_pose(element: Element) -> Pose:
 
 def read_joint(name: str, element: Element) -> JointElement:
     """Read a <joint>, or raise `UrdfError` if it is invalid."""
-    kind, of = element.text("type"), element.title
+    kind = element.text("type")
+    of = element.title
     if kind not in FREEDOM:
         raise element.error(f"{of} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}")
     element.refuse_near_miss("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
@@ -325,7 +326,8 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
             f"the links form {len(roots)} separate trees, with roots {enumerated(roots)}; connect "
             "them by joints"
         )
-    depth, level = 0, roots
+    depth = 0
+    level = roots
     while level:
         depth += 1
         for name in level:

@@ -175,7 +175,8 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
             inertial = _tag("inertial", {}, _origin(link.com) + mass + inertia)
         parts.append(_tag("link", {"name": link.name}, inertial))
     for joint in joints.values():
-        kind, limits = joint.type, _UNBOUNDED if joint.limits is None else joint.limits
+        kind = joint.type
+        limits = _UNBOUNDED if joint.limits is None else joint.limits
         inside = _tag("parent", {"link": joint.parent}) + _tag("child", {"link": joint.child})
         inside += _origin(joint.origin) + _tag("axis", {"xyz": joint.axis})
         inside += _tag("dynamics", {"damping": joint.damping, "friction": joint.friction})

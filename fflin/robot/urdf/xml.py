@@ -195,7 +195,9 @@ def notes_of(root: Element) -> list[str]:
 def parse(document: bytes, origin: str) -> Element:
     """Parse a document in its declared encoding, and return its root; refuse <!DOCTYPE>."""
     top = Element("", {}, 0, origin)
-    opened, count, parser = [top], 0, expat.ParserCreate()
+    opened = [top]
+    count = 0
+    parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         owner, line = opened[-1].owner, parser.CurrentLineNumber
