@@ -231,7 +231,32 @@ def simulate(
     >>> motion.u.shape[1], float(motion.t[-1])
     (9, 5.0)
     """
-    plan = Plan(SimulationOptions(**locals()))
+    plan = Plan(
+        SimulationOptions(
+            robot=robot,
+            policy=policy,
+            x0=x0,
+            q0=q0,
+            v0=v0,
+            duration=duration,
+            dt=dt,
+            method=method,
+            project=project,
+            sample=sample,
+            delay=delay,
+            limits=limits,
+            disturbance=disturbance,
+            events=events,
+            callback=callback,
+            linear=linear,
+            target=target,
+            frame=frame,
+            reference=reference,
+            every=every,
+            progress=progress,
+            engine=engine,
+        )
+    )
     foresees = predictor(plan)
     compiled = engine_of(engine, plan) == "compiled"
     hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
