@@ -313,7 +313,7 @@ _TITLE: dict[str, Callable[[Any], str]] = {
     "frame": "frame='{}'".format,
     "tool": "tool='{}'".format,
     "dt": lambda dt: f"dt={dt:g} s" if dt else "continuous",
-    "margin": lambda margin: f"margin={np.min(margin):.3g}",
+    "margin": lambda margin: f"pole_margin={np.min(margin):.3g}",
     "residual": lambda residual: f"residual={np.max(residual):.1e}",
 }
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -165,20 +165,23 @@ class Gain(ModelDesign):
             "warning": "; ".join(cautions(self)),
         }
         fold = partial(textwrap.fill, width=width())
-        rates = rates_of(self.poles, self.dt)
         margins = self.margins
-        result = (
-            f"{len(self.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
-            f"smallest damping ratio {float((-rates.real / np.abs(rates)).min()):.2g}"
-        )
         figures = (
             f"Riccati residual {self.residual:.1e} ({self.method}); margins for simultaneous "
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        head = f"{result}\n{fold(f'{head}, frame {self.frame}, {time}')}"
+        head = f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
         notes = [fold(f"{what}: {said}") for what, said in more.items() if said]
-        return "\n\n".join((head, f"K ({nu} x {nx}){shown}", _poles(self), fold(figures), *notes))
+        return "\n\n".join(
+            (
+                head,
+                f"K ({nu} x {nx}){shown}",
+                table_of_poles(self, "A - B K"),
+                fold(figures),
+                *notes,
+            )
+        )
 
     def _held(self) -> list[str]:
         """Return the inputs at the operating point, and the momentum that wheels gain there."""
@@ -328,13 +331,16 @@ def cautions(gain: Gain) -> list[str]:
 def _why_not_regulated(names: list[str]) -> str:
     """Return the reasons why a gain does not regulate the named states."""
     of_base = [name for name in names if name.startswith(("r_b.", "v_b."))]
+    angles = [name for name in names if name.startswith("q_m.")]
     reasons = list[str]()
     if of_base:
         reasons.append("no input pushes the base there")
-    if len(of_base) < len(names):
+    if angles:
+        reasons.append("the angle of a wheel has no effect on the motion")
+    if len(of_base) + len(angles) < len(names):
         reasons.append(
-            "no input reaches the wheel states, or other states determine them; wheel_speeds=True "
-            "(--wheel-speeds) regulates all controllable wheel speeds"
+            "no input reaches these wheel speeds, or other states determine them; "
+            "wheel_speeds=True (--wheel-speeds) regulates all controllable wheel speeds"
         )
     return "; ".join(reasons)
 
@@ -350,11 +356,36 @@ def _stopped_rotors(gain: Gain) -> list[str]:
     return [x for x in rotors if speeds.get(f"qdot_m.{x}", 0.0) > SPINNING]
 
 
-def _poles(gain: Gain) -> str:
-    """Return a table of the poles, slowest first; a conjugate pair or multiple pole has one row."""
-    poles = gain.poles[gain.poles.imag >= 0.0]
-    rates = rates_of(poles, gain.dt)
-    heads = ["pole" if gain.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
+class HasPoles(Protocol):
+    """Design with poles: [1/s] in continuous time, z for a sampling time dt [s]."""
+
+    @property
+    def poles(self) -> Poles:
+        """Poles (nz,)."""
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]; 0 for continuous time."""
+
+
+def summary_of_poles(design: HasPoles) -> str:
+    """Return the number of poles, the slowest decay and the smallest damping ratio."""
+    rates = rates_of(design.poles, design.dt)
+    damping = float((-rates.real / np.abs(rates)).min())
+    return (
+        f"{len(design.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
+        f"smallest damping ratio {damping:.2g}"
+    )
+
+
+def table_of_poles(design: HasPoles, matrix: str) -> str:
+    """Return a table of the poles of a matrix, slowest first.
+
+    A conjugate pair or a multiple pole has one row.
+    """
+    poles = design.poles[design.poles.imag >= 0.0]
+    rates = rates_of(poles, design.dt)
+    heads = ["pole" if design.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
     rows = Counter[tuple[str, ...]]()
     for k in np.argsort(-rates.real):
         pole, rate = poles[k], rates[k]
@@ -363,7 +394,7 @@ def _poles(gain: Gain) -> str:
     table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
     if max(rows.values()) == 1:
         table = [row[:-1] for row in table]
-    return f"poles of A - B K, slowest first\n\n{grid(cut(table), 'l')}"
+    return f"poles of {matrix}, slowest first\n\n{grid(cut(table), 'l')}"
 
 
 def _has_margin_of_kalman(gain: Gain) -> bool:

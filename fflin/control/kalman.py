@@ -17,8 +17,9 @@ from fflin.analysis.reduction import (
 from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
+from fflin.base.tables import folded
 from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
-from fflin.control.gain import Gain, ModelDesign
+from fflin.control.gain import Gain, ModelDesign, summary_of_poles, table_of_poles
 from fflin.control.lqr import at_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
@@ -97,6 +98,21 @@ class Estimator(ModelDesign):
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
 
+    def _report(self) -> str:
+        """Return the report with the poles and the states that are not estimated."""
+        count = len(self.estimated or self.state_names)
+        head = (
+            f"{self.robot}: estimator of {count} states from {len(self.output_names)} outputs, "
+            f"{_time(self.dt)}"
+        )
+        parts = [f"{summary_of_poles(self)}\n{folded([head])}"]
+        parts.append(table_of_poles(self, "A - L C"))
+        parts.append(f"Riccati residual {self.residual:.1e}")
+        left = [name for name in self.state_names if self.estimated and name not in self.estimated]
+        if left:
+            parts.append(folded([f"not estimated: {listed(left)}, which have no effect on the other states"]))
+        return "\n\n".join(parts)
+
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
 
@@ -154,6 +170,16 @@ class Compensator(ModelDesign):
     u0: Vector
     output_names: tuple[str, ...]
 
+    def _report(self) -> str:
+        """Return the report with the sizes and the poles of the closed loop."""
+        nu, nz = self.C.shape
+        head = (
+            f"{self.robot}: compensator with {nz} states, from {len(self.input_names)} outputs of "
+            f"the robot to {nu} inputs, {_time(self.dt)}"
+        )
+        poles = table_of_poles(self, "the closed loop")
+        return f"{summary_of_poles(self)}\n{folded([head])}\n\n{poles}"
+
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
@@ -167,6 +193,10 @@ class Compensator(ModelDesign):
         """
         names = self.state_names, self.input_names, self.output_names
         return state_space((self.A, self.B, self.C, 0.0), self.dt, *names)
+
+
+def _time(dt: float) -> str:
+    return f"sampled at {dt:g} s" if dt else "continuous"
 
 
 def kalman(

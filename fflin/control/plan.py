@@ -284,8 +284,9 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     """Return the error for a failed search, with the largest violations of the last trial."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
+    names = [f"the attitude about {axis}" for axis in "xyz"] + [*state.names[3:]]
     by = [
-        f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"
+        f"{words} {names[i]} by {far[i]:.3g} {units[i]}"
         for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
         for i in np.argsort(-far)[:3]
         if far[i] > _REACHED

@@ -13,6 +13,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, ArrayLike, frozen, function, instance, shaped, vector
 from fflin.control.channel import Law
+from fflin.control.gain import Gain
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame, readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
@@ -81,7 +82,7 @@ class StateFeedback(Feedback):
         Model that K was designed for. With a reduced model, only the states of the reduced model
         are fed back. If its point is not a fixed point, but inputs can hold the robot there, u0 is
         these inputs, as in `lqr`.
-    K : array_like (nu, nx)
+    K : array_like (nu, nx) or Gain
         Gain.
 
     Raises
@@ -104,7 +105,8 @@ class StateFeedback(Feedback):
 
     def __post_init__(self) -> None:
         hint = " (nu, nx); give the gain that was designed for this model"
-        self.K = frozen(shaped("K", self.K, about_point(self.lin).B.shape[::-1], hint))
+        K = self.K.K if isinstance(self.K, Gain) else self.K
+        self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
         self.lin = held_if_possible(self.lin)
 
     @property

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.fields import limits_of, travel_of
-from fflin.robot.inputs import BaseForce, BaseTorque
+from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -100,6 +100,11 @@ def _settings(robot: Robot) -> list[str]:
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
         "damping [N m s/rad | N s/m | 1/s]": robot.damping,
         "spring rest positions [rad | m]": robot.rest,
+        "reaction torques [N m/N]": {
+            thruster.name: thruster.torque
+            for thruster in robot.inputs
+            if isinstance(thruster, Thruster) and thruster.torque
+        },
         "passive joints": robot.passive,
         "locked joints": robot.locked,
         "gravity [m/s^2]": robot.gravity if any(robot.gravity) else (),

@@ -521,9 +521,11 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
         dt = plan.times.dt
         turn = float(np.abs(v[plan.plant.turning]).max()) * plan.times.dt
-        detail = f": a joint or the base rotates by {turn:.2g} rad per step"
-        known = LARGEST_TURN <= turn <= _LARGEST_SHOWN
-        return f"diverged at t = {t:g} s in steps of {dt:g} s{detail * known}; give a smaller dt"
+        shown = ""
+        if LARGEST_TURN <= turn <= _LARGEST_SHOWN:
+            shown = f": a joint or the base rotates by {turn:.2g} rad per step"
+        advice = "give a smaller dt; if that does not help, the loop itself is unstable"
+        return f"diverged at t = {t:g} s in steps of {dt:g} s{shown}; {advice}"
 
     return ending
 

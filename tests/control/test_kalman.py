@@ -155,3 +155,20 @@ def test_an_intensity_that_overflows_is_refused(name, robots):
     lin = fflin.linearize(robots[name])
     with np.errstate(all="ignore"), pytest.raises(fflin.DetectabilityError, match="scale"):
         fflin.kalman(lin, 1e308, 1e-4, G=lin.B)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_reports_show_the_slowest_pole_and_the_states_that_are_not_estimated(dt):
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-3)
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce(), wheel])
+    lin = fflin.linearize(robot)
+    model = lin.discretize(dt) if dt else lin
+    estimator = fflin.kalman(model, 1e-3, 1e-4)
+    compensator = fflin.lqg(fflin.lqr(model), estimator)
+    time = "sampled at 0.1 s" if dt else "continuous"
+    for design in (estimator, compensator):
+        rates = np.log(design.poles).real / dt if dt else design.poles.real
+        first, *others = str(design).splitlines()
+        assert first.startswith(f"{len(design.poles)} poles, slowest decay {-rates.max():.3g} 1/s")
+        assert time in " ".join(" ".join(others).split())
+    assert "not estimated: q_m.wheel_1, which" in " ".join(str(estimator).split())

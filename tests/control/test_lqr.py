@@ -521,3 +521,17 @@ def test_a_weight_by_names_is_of_a_model():
     for given in (fflin.lqr(lin), robot, 3):
         with pytest.raises(fflin.InputError, match="expected a LinearModel"):
             fflin.bryson(given, {"q_b": 0.1})
+
+
+def test_a_feedback_accepts_the_gain_with_its_report():
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    gain = fflin.lqr(lin)
+    assert (fflin.StateFeedback(lin, gain).K == gain.K).all()
+
+
+def test_the_angle_of_a_wheel_is_not_regulated_whatever_its_speed_is():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-3)
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce(), wheel])
+    report = " ".join(str(fflin.lqr(fflin.linearize(robot), wheel_speeds=True)).split())
+    assert says(report, "not regulated: q_m.wheel_1", "angle of a wheel has no effect")
+    assert "--wheel-speeds" not in report
