@@ -625,8 +625,11 @@ def _reached(
 
 def _dominant(vectors: Values, names: Sequence[str]) -> str:
     """Name the states with the largest entries in vectors (k, nx), for a message."""
-    sizes = np.abs(vectors)
-    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
+    # The vectors may be any basis of their space. The lengths of the projections of the coordinate
+    # axes onto this space do not depend on the basis.
+    basis, _ = np.linalg.qr(vectors.T)
+    sizes = np.linalg.norm(basis, axis=1)
+    large = sizes >= 0.3 * sizes.max()
     words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
     count = len(vectors)
     if large.sum() <= count:
