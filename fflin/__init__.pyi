@@ -106,6 +106,7 @@ from fflin.uncertainty.uncertain import Uncertain as Uncertain
 from fflin.uncertainty.lft import LFT as LFT
 
 # Policies
+from fflin.control.policy import Policy as Policy
 from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation

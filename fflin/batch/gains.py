@@ -17,7 +17,8 @@ from fflin.batch.linear_batch import LinearBatch
 from fflin.control.gain import Gain
 from fflin.control.lqr import regulator
 from fflin.control.optimal.riccati import Solution, half_size
-from fflin.control.policies import Feedback, Policy
+from fflin.control.policies import Feedback
+from fflin.control.policy import Command, StateForm
 from fflin.control.weights import weight
 from fflin.linear.fit import line_up
 from fflin.linear.model import LinearModel
@@ -236,7 +237,14 @@ class ScheduledFeedback(Feedback):
         by = self.gains
         return by.grid, by._interpolator.values.reshape(by.K.shape)
 
-    def bind(self, robot: Robot) -> Policy:
+    def form(self, robot: Robot) -> StateForm:
+        """Return the grid and its gains."""
+        self.state_map(robot)
+        grid, gains = self.table()
+        lin = self.lin
+        return StateForm(lin.u0 + gains @ lin.x0, gains, lin.x0, grid)
+
+    def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot; see `StateFeedback.bind` for errors."""
         lin, gains = self.lin, self.gains
         state = self.state_map(robot)

@@ -1,9 +1,8 @@
 """Dispersions: random changes of the robot, sensors, delay and initial state of each run."""
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from copy import copy
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, repeat
 from operator import attrgetter
@@ -19,17 +18,7 @@ from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
-from fflin.control.linear_controller import LinearController
-from fflin.control.policies import (
-    Allocation,
-    Policy,
-    StateFeedback,
-    bound,
-    decider,
-    feedback_of,
-    fresh,
-)
-from fflin.control.tracking import TrajectoryOutputFeedback
+from fflin.control.policy import Command, Policy, bound
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
@@ -67,20 +56,13 @@ class Dispersions:
     """Dispersions of `monte_carlo`: random changes of the plant, policy and initial state."""
 
     def __init__(
-        self, given: object, plant: Plant, policy: object, x0: Array, seed: int, times: Times
+        self, given: object, plant: Plant, policy: Policy | None, x0: Array, seed: int, times: Times
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
         robot = plant.robot
-        reads = decider(policy)
         self._model = robot._bare.model
-        sensors = tuple[str, ...]()
-        if isinstance(reads, StateFeedback):
-            sensors = reads.lin.state_names
-        elif isinstance(reads, LinearController):
-            sensors = reads.lin.output_names
-        elif isinstance(reads, TrajectoryOutputFeedback):
-            sensors = reads.filter.output_names
+        sensors = policy.sensors if policy else ()
         modes = tuple(map(attrgetter("name"), robot.modes))
         # {kind of dispersion: names of the quantities that can be dispersed}.
         self._known: dict[str, tuple[str, ...]] = {
@@ -146,10 +128,10 @@ class Dispersions:
         robot = self._plant.robot
         names = self._known[kind]
         if kind in _OF_SENSORS and not names:
+            named = self._policy.inner.kind if self._policy else "None"
             raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy "
-                f"({type(decider(self._policy)).__name__}) has no sensors; use a StateFeedback, "
-                "OutputFeedback or LinearController"
+                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy ({named}) has no "
+                "sensors; use a StateFeedback, OutputFeedback or LinearController"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
@@ -381,8 +363,8 @@ class Dispersions:
             runs |= pointed
         if self._kinds & {*_OF_SENSORS}:
             sensors = self._known["sensor"]
-            of_states = isinstance(decider(self._policy), StateFeedback)
-            names = plant.state.names if of_states else sensors
+            of_outputs = self._policy is not None and self._policy.senses_outputs
+            names = sensors if of_outputs else plant.state.names
             fed = [names.index(name) for name in sensors]
             for key, kind in (("sensed", "sensor"), ("noise", "noise")):
                 runs[key] = np.zeros((count, len(names)))
@@ -393,10 +375,10 @@ class Dispersions:
             runs["delay"] = self.delays(drawn)[:, None]
         return runs
 
-    def one(self, drawn: Array) -> tuple[Plant, object, Array, Array]:
+    def one(self, drawn: Array) -> tuple[Plant, Policy | None, Array, Array]:
         """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
         plant = self._plant
-        policy = fresh(self._policy)
+        policy = self._policy.fresh() if self._policy else None
         rows = drawn[None]
         robot, (q, v) = plant.robot, self.starts(rows)
         bodies = self.bodies(rows)
@@ -409,53 +391,51 @@ class Dispersions:
         for kind, values in self._springs(rows).items():
             springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))
         robot = replace(robot, stiffness=springs["stiffness"], damping=springs["damping"])
-        if self._kinds & {*_OF_SENSORS}:
+        if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = _with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
-            if isinstance(policy, Allocation):  # the allocation must use the nominal directions
-                nominal = bound(policy, plant.robot)
-                policy = _Bound(lambda _: nominal, feedback_of(policy)[0])
+            if policy and policy.commanded_robot:
+                # The allocation must use the nominal directions.
+                policy = _Bound(policy, plant.robot)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
         own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
         return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 
-class _Bound(NamedTuple):
-    """Policy whose method `bind` is a given function; `lin` is the policy's model, or None."""
+@dataclass(eq=False)
+class _Bound(Policy):
+    """Policy that is bound to a given robot, whatever robot is simulated."""
 
-    bind: Callable[[Robot], Policy]
-    lin: LinearModel | None = None
+    policy: Policy
+    robot: Robot
+
+    @property
+    def model(self) -> LinearModel | None:
+        """Model of the policy."""
+        return self.policy.model
+
+    def bind(self, robot: Robot) -> Command:
+        """Return the command of the policy for its own robot."""
+        return bound(self.policy, self.robot)
 
 
-def _with_sensor_errors(policy: object, bias: Array, deviation: Array, seed: Array) -> object:
+def _with_sensor_errors(policy: Policy, bias: Array, deviation: Array, seed: Array) -> Policy:
     """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.
 
     The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
     contains the standard deviations of the noise. `seed` (1,) is the seed of the noise.
     """
-    if isinstance(policy, Allocation):
-        return replace(policy, policy=_with_sensor_errors(policy.policy, bias, deviation, seed))
-    generator, given = noise_generator(seed[0]), getattr(policy, "noise", None)
+    generator = noise_generator(seed[0])
+    given = policy.measurement_noise
 
     def error(t: float) -> Array:
-        found: Array = bias + deviation * generator.standard_normal(len(bias))
-        return found if given is None else found + np.asarray(given(t))
+        drawn: Array = bias + deviation * generator.standard_normal(len(bias))
+        return drawn if given is None else drawn + np.asarray(given(t))
 
-    if isinstance(policy, LinearController | TrajectoryOutputFeedback):
-        noisy = copy(policy)
-        noisy.noise = error
-        return noisy
-    assert isinstance(policy, StateFeedback)
-    K = policy.K
-
-    def bind(robot: Robot) -> Policy:
-        inner = policy.bind(robot)
-        return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ error(t)
-
-    return _Bound(bind, policy.lin)
+    return policy.with_sensor_errors(error)
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

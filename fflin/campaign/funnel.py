@@ -20,7 +20,7 @@ from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named, of_campaign
-from fflin.control.tracking import TrajectoryFeedback, followed
+from fflin.control.tracking import TrajectoryFeedback, prepared
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of, start_of
@@ -351,9 +351,10 @@ def funnel(
     2
     """
     validation.instance("robot", robot, Robot, "a fflin.Robot")
-    policy = followed(schedule, robot)
     expected = "a GainSchedule or a TrajectoryFeedback"
-    feedback = validation.instance("schedule", policy, TrajectoryFeedback, expected)
+    validation.instance("schedule", schedule, (GainSchedule, TrajectoryFeedback), expected)
+    feedback = prepared(schedule, robot)
+    assert isinstance(feedback, TrajectoryFeedback)
     require_known("option of funnel", options, _OPTIONS)
     samples = validation.count("samples", samples)
     seed = validation.whole("seed", seed, 0)

@@ -299,7 +299,7 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
         raise UnknownNameError(f"{error}{hint}") from None
 
 
-def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str, Any]]:
+def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[fflin.Policy | None, dict[str, Any]]:
     """Return the policy (None with --free), and keyword arguments of `simulate`."""
     from fflin.simulation.plan import SHORTEST, time_to_settle
 
@@ -333,7 +333,7 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[object, dict[str,
         if not point_of(robot, arguments, "target_")[0][:3].any():
             q = on_orbit(robot, q, linear.lin.frame)
     if arguments.duration is None:
-        design = policy.design if isinstance(policy, fflin.Allocation) else robot
+        design = policy.commanded_robot or robot
         settings["duration"] = time_to_settle(design, linear, q, v)
     return policy, settings | {"q0": q, "v0": v, "linear": lin}
 
@@ -361,7 +361,7 @@ def start_of(
 
 def about_point(
     robot: fflin.Robot, arguments: Namespace
-) -> tuple[object, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
+) -> tuple[fflin.Policy, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
     """Return the policy about a point, its linear feedback, and the model that predicts the motion.
 
     The model is None for MPC, for a reduced model, for a controller from a file, and for allocated

@@ -173,7 +173,7 @@ def montecarlo(arguments: Namespace) -> Report:
     example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
     """
     from fflin.campaign.report import campaign_record, worst_runs
-    from fflin.control.policies import bound
+    from fflin.control.policy import BoundLaw, bound
 
     path = arguments.output_file
     is_table = path is not None and path.suffix in (".csv", ".mat")
@@ -204,7 +204,8 @@ def montecarlo(arguments: Namespace) -> Report:
         arguments.plot: lambda file: fflin.plot_campaign(campaign, file),
         **pictures(robot, worst, arguments),
     }
-    notes = getattr(bound(policy, robot), "notes", ()) if policy else ()
+    command = bound(policy, robot) if policy else None
+    notes = command.notes if isinstance(command, BoundLaw) else ()
     shown = [str(campaign), *(folded([note]) for note in notes)]
     text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
     result = {**campaign_record(campaign, arguments.worst), "notes": notes}

@@ -110,7 +110,9 @@ class Estimator(ModelDesign):
         parts.append(f"Riccati residual {self.residual:.1e}")
         left = [name for name in self.state_names if self.estimated and name not in self.estimated]
         if left:
-            parts.append(folded([f"not estimated: {listed(left)}, which have no effect on the other states"]))
+            parts.append(
+                folded([f"not estimated: {listed(left)}, which have no effect on the other states"])
+            )
         return "\n\n".join(parts)
 
     def to_control(self) -> ControlSystem:

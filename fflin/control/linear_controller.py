@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,19 +20,17 @@ from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, Noise, Sample, decider, feedback_of
+from fflin.control.policies import Feedback, Loop, Sample
+from fflin.control.policy import Noise, OutputForm, Policy, Predictor, unstable_note
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import about_point, require_fit
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default signal names such as u[0], or no name
-
-# A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds
-# _ROUNDING * (1 + largest pole magnitude).
-_ROUNDING = 1e-6
 
 
 class System(NamedTuple):
@@ -162,10 +161,76 @@ class LinearController(Feedback):
         self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
+    senses_outputs: ClassVar[bool] = True
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Note on the momentum that wheels gain while they hold the robot at the point."""
         return wheel_notes(self.lin)
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return self.dt
+
+    @property
+    def measurement_noise(self) -> Noise | None:
+        """The function noise(t)."""
+        return self.noise
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the outputs of the model."""
+        return self.lin.output_names
+
+    @property
+    def fed_back(self) -> tuple[str, ...]:
+        """Names of the states that the outputs measure on which the controller acts."""
+        acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
+        return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the controller with other measurement noise."""
+        noisy = copy(self)
+        noisy.noise = error
+        return noisy
+
+    def closed_loop(self) -> tuple[Array, float] | None:
+        """Return the closed-loop matrix of model and controller, and dt [s]."""
+        return self.loop, self.dt
+
+    def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
+        """Return the function from a sampled model to its closed-loop matrix."""
+        return self.sampled(sample).loop_with
+
+    def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
+        """Return notes on unstable poles of the linear loop and of the controller by itself."""
+        hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
+        of_loop = unstable_note("linear loop", self.loop, self.dt, hint)
+        return of_loop + unstable_note("controller by itself", self.system.A, self.dt, "")
+
+    def held_for(self, seconds: float) -> Policy:
+        """Return the controller, sampled if it is continuous."""
+        return self.sampled(seconds)
+
+    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
+        """Return the predictor of the closed loop with the model `lin`."""
+        if not self.dt:
+            both, gains, offset = self.around(lin)
+            return both, lambda e: offset + gains @ e
+        terms = self.terms()
+        z: Array = np.zeros(len(terms.A))
+
+        def command(e: Array) -> Array:
+            nonlocal z
+            u, z = terms.step(z, lambda u: lin.y0 + lin.C @ e + lin.D @ (u - lin.u0))
+            return u
+
+        return lin, command
+
+    def form(self, robot: Robot) -> OutputForm:
+        """Return the matrices of the controller, which are the same at all times."""
+        return OutputForm(self.bind(robot), self.terms, None)
 
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
@@ -211,9 +276,9 @@ class LinearController(Feedback):
     def loop(self) -> Array:
         """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
         lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
-        return self.loop_around(lin)
+        return self.loop_with(lin)
 
-    def loop_around(self, lin: LinearModel) -> Array:
+    def loop_with(self, lin: LinearModel) -> Array:
         """Return the closed-loop matrix of the controller and another model with its signals."""
         both, K, _ = self.around(lin)
         loop: Array = both.A + both.B @ K
@@ -226,67 +291,6 @@ class LinearController(Feedback):
             return self
         A, B = held_exponential(by.A, by.B, dt)
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
-
-
-def growing(policy: object, held: float = 0.0) -> tuple[str, ...]:
-    """Return notes on the poles of a linear loop that are unstable, and of its controller.
-
-    `held` is the time [s] for which the commands of the policy are held; 0 if it is continuous.
-    """
-    by = decider(policy)
-    if not isinstance(by, LinearController):
-        return _growing_feedback(policy, held)
-    hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
-    of_loop = _unstable("linear loop", by.loop, by.dt, hint)
-    return of_loop + _unstable("controller by itself", by.system.A, by.dt, "")
-
-
-def _unstable(what: str, matrix: Array, dt: float, advice: str) -> tuple[str, ...]:
-    """Return a note if a pole of `matrix` (n, n) is unstable; dt [s] is 0 in continuous time."""
-    poles = np.linalg.eigvals(matrix)
-    growth = np.abs(poles) - 1.0 if dt else poles.real
-    if not (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
-        return ()
-    pole = complex(poles[growth.argmax()])
-    unit = "" if dt else " 1/s"
-    return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
-
-
-def _growing_feedback(policy: object, held: float) -> tuple[str, ...]:
-    """Return a note if the linear loop of a state feedback is unstable."""
-    lin, K = feedback_of(policy)
-    if lin is None or K is None:
-        return ()
-    loop = lin.A - lin.B @ K
-    own = _unstable("linear loop", loop[_on_feedback(loop, K)], lin.dt, "")
-    if own or lin.dt or not held:
-        return own
-    sampled = lin.discretize(held)
-    advice = (
-        f"; the gain was designed in continuous time, but its commands are held for {held:g} s: "
-        f"shorten the sample time, or design the gain for it (lin.discretize({held:g}))"
-    )
-    loop = sampled.A - sampled.B @ K
-    return _unstable("sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice)
-
-
-def _on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
-    """Return rows and columns of the states that affect the states that the gain K feeds back.
-
-    Other states, such as the position of a base that no input pushes, may drift in a stable loop.
-    """
-    acting = K.any(axis=0)
-    for _ in A:
-        acting = acting | A[acting].any(axis=0)
-    return np.ix_(acting, acting)
-
-
-def closed_loop(policy: object) -> tuple[Array, float] | None:
-    """Return the closed-loop matrix and dt [s] of a linear policy, or None for other policies."""
-    (lin, K), by = feedback_of(policy), decider(policy)
-    if isinstance(by, LinearController):
-        return by.loop, by.dt
-    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt)
 
 
 class OutputFeedback(LinearController):

@@ -17,7 +17,8 @@ from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, num
 from fflin.control.gain import Gain
 from fflin.control.lqr import at_fixed_point, regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Deviation, Feedback, Policy, StateFeedback, next_sample
+from fflin.control.policies import Deviation, Feedback, StateFeedback, next_sample
+from fflin.control.policy import BoundLaw, Command
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator
 from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
@@ -174,7 +175,7 @@ class _Predictive(Feedback):
         said = f"{by.samples} samples of {by.dt:g} s, {len(by.limited)} limits"
         return f"{type(self).__name__}('{by.robot}', {said})"
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot with the same states and inputs."""
         return Receding(self.horizon, self.deviation(robot))
 
@@ -432,7 +433,7 @@ class Horizon:
         return low, high, soft
 
 
-class Receding:
+class Receding(BoundLaw):
     """Policy that applies the first input of each plan.
 
     `at(t, q, v)` returns the reference inputs u* and the error e.

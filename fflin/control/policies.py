@@ -1,19 +1,27 @@
 """Policies that compute the inputs: state feedback about a point, and allocation."""
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, replace
-from itertools import compress
-from types import BuiltinFunctionType, FunctionType
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, ArrayLike, frozen, function, instance, shaped, vector
+from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
 from fflin.control.gain import Gain
+from fflin.control.policy import (
+    BoundLaw,
+    Command,
+    Noise,
+    Policy,
+    Predictor,
+    Reference,
+    StateForm,
+    as_policy,
+    bound,
+)
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame, readout
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
@@ -22,35 +30,25 @@ from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
+from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
-
-Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
-
-# Function of time that returns measurement noise (ny,).
-Noise: TypeAlias = Callable[[float], ArrayLike]
 
 # Function of t, q and v that returns the reference inputs u*, and the error e relative to the
 # reference.
 Deviation: TypeAlias = Callable[[float, Array, Array], tuple[Array, Array]]
 
 
-@runtime_checkable
-class Gridded(Protocol):
-    """State feedback whose gain is interpolated between the points of a grid."""
-
-    lin: LinearModel
-
-    def table(self) -> tuple[dict[str, Array], Array]:
-        """Return the grid values of each joint, and the gains (N, nu, nx) at the grid points."""
-        ...
-
-
-class Feedback:
+class Feedback(Policy):
     """Feedback of the state or of the outputs, about an operating point or along a trajectory."""
 
     lin: LinearModel
+
+    @property
+    def model(self) -> LinearModel | None:
+        """Model about whose operating point the law acts."""
+        return self.lin
 
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's state map in the model's axes.
@@ -114,13 +112,38 @@ class StateFeedback(Feedback):
         """Note on the momentum that wheels gain while they hold the robot at the point."""
         return wheel_notes(self.lin)
 
+    @property
+    def feedback_gain(self) -> Array | None:
+        """The gain K."""
+        return self.K
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the states of the model."""
+        return self.lin.state_names
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the feedback of states with errors."""
+        return _Erring(self, error)
+
+    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
+        """Return the predictor of the closed loop with the model `lin`."""
+        K, constant, _ = self.terms(state)
+        at_point = constant - K @ lin.x0
+        return lin, lambda e: at_point - K @ e
+
+    def form(self, robot: Robot) -> StateForm:
+        """Return the gain of the full state."""
+        K, offset, x0 = self.terms(self.state_map(robot))
+        return StateForm(offset[None], K[None], x0, {})
+
     def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
         lin = self.lin
         S = selection(self.lin.state_names, state.names)
         return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot.
 
         Raises
@@ -133,7 +156,26 @@ class StateFeedback(Feedback):
 
 
 @dataclass(eq=False)
-class Allocation:
+class _Erring(Policy):
+    """State feedback of a model's states with errors."""
+
+    feedback: StateFeedback
+    error: Callable[[float], Array]
+
+    @property
+    def model(self) -> LinearModel | None:
+        """Model of the feedback."""
+        return self.feedback.lin
+
+    def bind(self, robot: Robot) -> Command:
+        """Return the command with the errors of the sensors."""
+        command = self.feedback.bind(robot)
+        K = self.feedback.K
+        return lambda t, q, v: np.asarray(command(t, q, v)) - K @ self.error(t)
+
+
+@dataclass(eq=False)
+class Allocation(Policy):
     """Allocation of a policy's commands to thrusters and motors within their limits.
 
     The policy commands the inputs of the robot `design`, such as torque and force on the base. The
@@ -162,7 +204,95 @@ class Allocation:
     policy: object
     design: Robot
 
-    def bind(self, robot: Robot) -> Policy:
+    @property
+    def commanded_robot(self) -> Robot | None:
+        """The robot `design`."""
+        return self.design
+
+    @property
+    def inner(self) -> Policy:
+        """The policy whose commands are allocated."""
+        return as_policy(self.policy)
+
+    @property
+    def model(self) -> LinearModel | None:
+        """Model of the inner policy."""
+        return self.inner.model
+
+    @property
+    def feedback_gain(self) -> Array | None:
+        """Gain of the inner policy."""
+        return self.inner.feedback_gain
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s] of the inner policy."""
+        return self.inner.sample_time
+
+    @property
+    def measurement_noise(self) -> Noise | None:
+        """Measurement noise of the inner policy."""
+        return self.inner.measurement_noise
+
+    @property
+    def senses_outputs(self) -> bool:  # type: ignore[override]
+        """Whether the sensors of the inner policy are outputs."""
+        return self.inner.senses_outputs
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors of the inner policy."""
+        return self.inner.sensors
+
+    @property
+    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
+        """Frame and reference of the inner policy."""
+        return self.inner.axes
+
+    @property
+    def reference_motion(self) -> Reference | None:
+        """Motion that the inner policy follows."""
+        return self.inner.reference_motion
+
+    @property
+    def followed_trajectory(self) -> Trajectory | None:
+        """Trajectory that the inner policy follows."""
+        return self.inner.followed_trajectory
+
+    @property
+    def fed_back(self) -> tuple[str, ...]:
+        """States that the inner policy feeds back."""
+        return self.inner.fed_back
+
+    def poles_along(self) -> Array:
+        """Return the poles of the inner policy's loop along its trajectory."""
+        return self.inner.poles_along()
+
+    def closed_loop(self) -> tuple[Array, float] | None:
+        """Return the closed loop of the inner policy, without limits."""
+        return self.inner.closed_loop()
+
+    def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
+        """Return the closed loop of the inner policy about a model."""
+        return self.inner.loop_around(sample)
+
+    def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
+        """Return the notes on the loop of the inner policy."""
+        return self.inner.loop_notes(held)
+
+    def held_for(self, seconds: float) -> Policy:
+        """Return the allocation of commands that are held."""
+        return replace(self, policy=self.inner.held_for(seconds))
+
+    def fresh(self) -> Policy:
+        """Return the allocation of an inner policy without memory of earlier runs."""
+        return replace(self, policy=self.inner.fresh())
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the allocation of an inner policy whose sensors have errors."""
+        return replace(self, policy=self.inner.with_sensor_errors(error))
+
+    def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot.
 
         Raises
@@ -180,18 +310,19 @@ class Allocation:
         return AllocatedPolicy(self, robot)
 
 
-class AllocatedPolicy:
+class AllocatedPolicy(BoundLaw):
     """Policy that realises the commands of an `Allocation` with the inputs of a robot."""
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
-        frame, reference = axes_of(allocation)
+        frame, reference = allocation.axes
         self._design = Actuation(StateMap(allocation.design, reference=reference, frame=frame))
         self._robot = Actuation(StateMap(robot, reference=reference, frame=frame))
         names = self._design.names
         free = np.full(len(names), np.inf)
         inner = bound(allocation.policy, allocation.design)
         self._command = Law(inner, names, (-free, free), np.inf)
-        self.advance: Callable[..., None] | None = getattr(inner, "advance", None)
+        self._inner = inner if isinstance(inner, BoundLaw) else None
+        self.advance = self._inner.advance if self._inner else None
         self._data, self._design_data = robot.create_data(), allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 
@@ -200,8 +331,8 @@ class AllocatedPolicy:
         """Notes on a run: how the commands are realised, and the notes of the inner policy."""
         asked, given = (", ".join(each.groups) for each in (self._design, self._robot))
         said = f"allocation: the commanded {asked} are realised by {given}"
-        same = self._design.names == self._robot.names
-        return (*[said] * (not same), *getattr(self._command.policy, "notes", ()))
+        notes = self._inner.notes if self._inner else ()
+        return notes if self._design.names == self._robot.names else (said, *notes)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
@@ -290,7 +421,7 @@ class Sample(NamedTuple):
         return u, self.A @ z + self.B @ (measure(u) - self.y0)
 
 
-class Loop:
+class Loop(BoundLaw):
     """Policy that measures a robot's outputs and computes the command with a compensator.
 
     The compensator's state z advances at each sample, or at each stage of the integrator if dt is
@@ -352,76 +483,3 @@ class Loop:
             if last:
                 self.rates = [self.estimate]
                 self.stages = 0
-
-
-def decider(policy: object) -> object:
-    """Return the inner policy of an allocation, or the policy itself."""
-    return policy.policy if isinstance(policy, Allocation) else policy
-
-
-# Functions have no memory of their own that could be copied.
-_FUNCTIONS = FunctionType, BuiltinFunctionType
-
-
-def axes_of(policy: object) -> tuple[Frame | None, pin.SE3 | None]:
-    """Return the frame and the reference of a policy's states; each is None if it is unknown."""
-    lin, _ = feedback_of(policy)
-    if lin is not None:
-        return lin.frame, lin.reference
-    by = decider(policy)
-    return getattr(by, "frame", None), getattr(by, "origin", None)
-
-
-def bound(policy: object, robot: Robot) -> Policy:
-    """Return a policy bound to a robot, or raise `InputError` if the object is not a policy."""
-    result: object = policy.bind(robot) if hasattr(policy, "bind") else policy
-    if not callable(result):
-        raise InputError(
-            f"policy has type {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
-            "StateFeedback(lin, gain.K)"
-        )
-    function("policy", result, "(t, q, v)")
-    return result
-
-
-def fresh(policy: object) -> object:
-    """Return a policy for one more run, without the memory of an earlier run.
-
-    A policy with a method `bind` gets new memory when it is bound. Of any other object, this is a
-    copy, after its method `reset` was called if it has one. Plain functions are not copied.
-    """
-    if isinstance(policy, Allocation):
-        return replace(policy, policy=fresh(policy.policy))
-    if policy is None or hasattr(policy, "bind") or isinstance(policy, _FUNCTIONS):
-        return policy
-    try:
-        own = deepcopy(policy)
-    except TypeError:  # it holds something that cannot be copied, such as a lock
-        own = policy
-    reset = getattr(own, "reset", None)
-    if callable(reset):
-        reset()
-    return own
-
-
-def feedback_of(policy: object) -> tuple[LinearModel | None, Array | None]:
-    """Return the model and the gain K of a policy, or None for each that the policy lacks."""
-    by = decider(policy)
-    lin = getattr(by, "lin", None)
-    return (lin if isinstance(lin, LinearModel) else None), getattr(by, "K", None)
-
-
-def fed_back(policy: object) -> tuple[str, ...]:
-    """Return the names of the states that a policy feeds back, or () if they are unknown."""
-    (lin, K), schedule = feedback_of(policy), getattr(decider(policy), "schedule", None)
-    if schedule is not None:
-        K = np.abs(schedule.K).max(axis=0)  # largest entries over time
-    names: tuple[str, ...] = getattr(lin if schedule is None else schedule, "state_names", ())
-    if K is not None:
-        return tuple(compress(names, np.abs(K).max(axis=0, initial=0.0)))
-    system = getattr(decider(policy), "system", None)
-    if lin is None or system is None:
-        return names
-    # A controller of outputs feeds back the states that its outputs measure.
-    outputs = system.B.any(axis=0) | system.D.any(axis=0)
-    return tuple(compress(names, lin.C[outputs].any(axis=0)))

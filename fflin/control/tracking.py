@@ -1,6 +1,7 @@
 """Trajectory tracking: feedback of the state or of the outputs along a trajectory."""
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import ClassVar
@@ -10,10 +11,19 @@ import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
-from fflin.base.validation import Array, ArrayLike, instance
+from fflin.base.validation import Array, instance
 from fflin.control.kalman import kalman
-from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Policy, Sample, decider
+from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Sample
+from fflin.control.policy import (
+    Command,
+    Noise,
+    OutputForm,
+    PathForm,
+    Policy,
+    Reference,
+    as_policy,
+    states_of_gain,
+)
 from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
 from fflin.control.tvlqr import FilterSchedule, GainSchedule
 from fflin.dynamics.coordinates import Frame, moved_by, moving_error
@@ -69,6 +79,56 @@ class TrajectoryFeedback(Feedback):
         instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
         expected = "a GainSchedule, as fflin.tvlqr returns it"
         instance("schedule", self.schedule, GainSchedule, expected)
+
+    @property
+    def model(self) -> LinearModel | None:
+        """None, because the law acts about no point."""
+        return None
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s] of the schedule; 0 if it is continuous."""
+        return self.schedule.dt
+
+    @property
+    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
+        """Base axes; the reference is free."""
+        return self.frame, None
+
+    @property
+    def reference_motion(self) -> Reference | None:
+        """The trajectory and its end as a function of time."""
+        return self.reference
+
+    @property
+    def followed_trajectory(self) -> Trajectory | None:
+        """The trajectory."""
+        return self.trajectory
+
+    @property
+    def fed_back(self) -> tuple[str, ...]:
+        """States with a gain at any time."""
+        return states_of_gain(self.schedule.state_names, self.schedule.K)
+
+    def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
+        """Return the inputs of the trajectory at its start."""
+        return self.reference(0.0)[2]
+
+    def reference_inputs(self, names: tuple[str, ...]) -> tuple[str, Array] | None:
+        """Return the inputs at all knots."""
+        return "on its trajectory", self.trajectory.u_base
+
+    def held_for(self, seconds: float) -> Policy:
+        """Return the law with held commands."""
+        return replace(self, held=True)
+
+    def poles_along(self) -> Array:
+        """Return the poles [1/s] of the robot and of the loop; empty for a sampled schedule."""
+        return poles_along(self.schedule)
+
+    def form(self, robot: Robot) -> PathForm | OutputForm | None:
+        """Return the trajectory and the gains."""
+        return PathForm(self)
 
     @property
     def duration(self) -> float:
@@ -185,7 +245,7 @@ class TrajectoryFeedback(Feedback):
 
         return deviation
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot.
 
         Raises
@@ -203,27 +263,13 @@ class TrajectoryFeedback(Feedback):
         return policy
 
 
-def followed(policy: object, robot: Robot, held: float = 0.0) -> object:
-    """Prepare a policy for a simulation in which commands are held for `held` [s].
-
-    `held` is 0 if commands are not held. A gain schedule is replaced by the feedback along its
-    trajectory. If commands are held, a continuous linear controller is sampled.
-    """
+def prepared(policy: object, robot: Robot) -> Policy:
+    """Return a policy for a robot; a gain schedule becomes the feedback along its trajectory."""
     if isinstance(policy, Allocation):
-        return replace(policy, policy=followed(policy.policy, policy.design, held))
+        return replace(policy, policy=prepared(policy.policy, policy.design))
     if isinstance(policy, GainSchedule):
-        return TrajectoryFeedback(policy.trajectory(robot), policy, held=held > 0.0)
-    if held and isinstance(policy, TrajectoryFeedback):
-        return replace(policy, held=True)
-    if held and isinstance(policy, LinearController):
-        return policy.sampled(held)
-    return policy
-
-
-def tracking_of(policy: object) -> TrajectoryFeedback | None:
-    """Return the trajectory feedback in a policy or allocation, or None if there is none."""
-    decides = decider(policy)
-    return decides if isinstance(decides, TrajectoryFeedback) else None
+        return TrajectoryFeedback(policy.trajectory(robot), policy)
+    return as_policy(policy)
 
 
 @lru_cache(maxsize=2)  # saves half the time of a short run
@@ -275,7 +321,9 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
     """
 
     filter: FilterSchedule
-    noise: Callable[[float], ArrayLike] | None = None
+    noise: Noise | None = None
+
+    senses_outputs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -310,6 +358,26 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         dt = self.filter.dt
         sizes = self.filter.L.shape[1:]
         return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *there(t)), self.noise)
+
+    @property
+    def measurement_noise(self) -> Noise | None:
+        """The function noise(t)."""
+        return self.noise
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.filter.output_names
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the law with other measurement noise."""
+        noisy = copy(self)
+        noisy.noise = error
+        return noisy
+
+    def form(self, robot: Robot) -> OutputForm:
+        """Return the matrices for each sample of the trajectory, and for the robot at rest."""
+        return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property
     def _rest(self) -> tuple[LinearModel, Array]:

@@ -24,8 +24,9 @@ from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, read_file, write_atomically
-from fflin.control.policies import Loop, Measure, Policy
-from fflin.dynamics.coordinates import frame_of
+from fflin.control.policies import Loop, Measure
+from fflin.control.policy import Command, Policy
+from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.export.laws import CASES, Law, law_of, measured
@@ -166,7 +167,7 @@ def _description(path: Path) -> dict[str, Any]:
     return about
 
 
-class CLaw:
+class CLaw(Policy):
     """Policy that compiles C code written by `write_c` and calls it.
 
     The C compiler of the system (``cc``) compiles the code to a shared library in a temporary
@@ -232,7 +233,7 @@ class CLaw:
         [self.name] = found
         self._about = _description(source / f"{self.name}.json")
         self.dt: float = self._about["dt"]
-        self.frame: str = self._about["frame"]
+        self.frame: Frame = self._about["frame"]
         self.initial_inputs: Array = frozen(np.array(self._about["u0"], dtype=float))
         placement = self._about["reference"]
         self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
@@ -244,6 +245,20 @@ class CLaw:
         self._real = np.float64 if self._about["real"] == "double" else np.float32
         self._step = getattr(_compiled(source / f"{self.name}.c", compiler), f"{self.name}_step")
 
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return self.dt
+
+    @property
+    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
+        """Frame and reference of the code."""
+        return self.frame, self.origin
+
+    def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
+        """Return the inputs of the code at its target."""
+        return self.initial_inputs
+
     def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
         return self._made, ()  # compile again, because a loaded library cannot be copied
 
@@ -251,7 +266,7 @@ class CLaw:
         about = self._about
         return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
 
-    def bind(self, robot: Robot) -> Policy:
+    def bind(self, robot: Robot) -> Command:
         """Return the function policy(t, q, v) -> u for a robot.
 
         Each call of `bind` returns a policy with a separate controller memory.

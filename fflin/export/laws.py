@@ -1,6 +1,6 @@
 """Conversion of control laws to the tables of their C code, and test cases for this code."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -14,9 +14,9 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
-from fflin.control.linear_controller import LinearController
-from fflin.control.policies import Gridded, Policy, Sample, StateFeedback, bound
-from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
+from fflin.control.policies import Sample, StateFeedback
+from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
+from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import Signals, signals_of
@@ -27,8 +27,7 @@ from fflin.robot.robot import Robot
 
 CASES = 200
 
-OfStates: TypeAlias = Gain | StateFeedback | Gridded | GainSchedule | TrajectoryFeedback
-OfOutputs: TypeAlias = LinearController | Compensator
+Design: TypeAlias = Gain | GainSchedule | Compensator | Policy
 
 
 class Case(NamedTuple):
@@ -80,14 +79,19 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
 def law_of(given: object, robot: object, limits: object) -> Law:
     """Convert a policy or a controller design to a `Law`, with `limits` as in `simulate`."""
-    if isinstance(given, TrajectoryOutputFeedback) or not isinstance(given, OfStates | OfOutputs):
-        raise InputError(
-            f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
-            "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
-        )
-    lin = given._lin if isinstance(given, Gain) else getattr(given, "lin", None)
-    if robot is None:
-        robot = lin._robot if lin else getattr(getattr(given, "trajectory", None), "robot", None)
+    if not isinstance(given, Gain | GainSchedule | Compensator | Policy):
+        raise _not_written(given)
+    lin = None
+    trajectory = None
+    if isinstance(given, Gain):
+        lin = given._lin
+    elif isinstance(given, Policy):
+        lin = given.model
+        trajectory = given.followed_trajectory
+    if robot is None and lin:
+        robot = lin._robot
+    if robot is None and trajectory:
+        robot = trajectory.robot
     if robot is None:
         # A law that was read from a file contains only the robot's name, which `load` may know.
         with suppress(FflinError):
@@ -99,7 +103,7 @@ def law_of(given: object, robot: object, limits: object) -> Law:
             f"the robot of this {type(given).__name__} {said}; give the robot of the design with "
             "robot= (--robot)"
         )
-    law = _output_law(given, robot) if isinstance(given, OfOutputs) else _state_law(given, robot)
+    law = _law_of(given, robot)
     high = np.full(len(law.inputs[0]), np.inf)
     low = -high
     if limits is not None:
@@ -113,32 +117,75 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     return law
 
 
-def _state_law(given: OfStates, robot: Robot) -> Law:
-    lin = None
-    axes = dict[str, Array]()
+def _not_written(given: object) -> InputError:
+    return InputError(
+        f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
+        "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
+    )
+
+
+def _law_of(given: Design, robot: Robot) -> Law:
+    """Convert a policy or a controller design for a robot."""
     title = type(given).__name__
-    if isinstance(given, GainSchedule):
-        given = TrajectoryFeedback(given.trajectory(robot), given)
-    if isinstance(given, TrajectoryFeedback):
-        dt = given.schedule.dt
-        state = given.state_map(robot)
-        tables = _samples(given, state)
-    else:
-        if isinstance(given, Gain):
-            made = f"the gain was designed for '{given.robot}'"
-            own = given._lin or model_of(given, robot, made, pin.XYZQUATToSE3(given.placement))
-            dt = given.dt
-            given = StateFeedback(own, given.K)
-        else:
-            dt = given.lin.dt
-        lin = given.lin
-        axes, gains = given.table() if isinstance(given, Gridded) else ({}, given.K[None])
-        laws = [StateFeedback(lin, gain) for gain in gains]
-        state = laws[0].state_map(robot)
-        _, _, x0 = laws[0].terms(state)
-        tables = {"reference": lin.placement[None], "x0": x0[None], "u0": lin.u0[None]}
-        tables["K"] = np.array([law.terms(state)[0] for law in laws])
-    cases = list(_state_cases(state, bound(given, robot), dt, tables, axes))
+    if isinstance(given, Compensator):
+        return _compensator_law(given, robot)
+    policy = given
+    if isinstance(policy, GainSchedule):
+        policy = TrajectoryFeedback(policy.trajectory(robot), policy)
+    if isinstance(policy, Gain):
+        made = f"the gain was designed for '{policy.robot}'"
+        own = policy._lin or model_of(policy, robot, made, pin.XYZQUATToSE3(policy.placement))
+        policy = StateFeedback(own, policy.K)
+    form = policy.form(robot)
+    if isinstance(form, StateForm) and policy.model:
+        dt = given.dt if isinstance(given, Gain) else policy.sample_time
+        return _state_law(title, policy, dt, form, robot)
+    if isinstance(form, PathForm):
+        state = form.policy.state_map(robot)
+        return _law_of_states(title, policy, state, _samples(form.policy, state), {}, robot)
+    lin = policy.model
+    if isinstance(form, OutputForm) and not form.samples and lin:
+        return _output_law(
+            title,
+            form.terms(0.0),
+            inputs=(lin.input_names, lin.input_units),
+            signals=(lin.output_names, lin.output_units),
+            dt=policy.sample_time,
+            robot=robot,
+            lin=lin,
+        )
+    raise _not_written(given)
+
+
+def _state_law(title: str, policy: Policy, dt: float, form: StateForm, robot: Robot) -> Law:
+    """Convert a state feedback about the point of a model."""
+    lin = policy.model
+    assert lin is not None
+    frame, reference = policy.axes
+    state = StateMap(robot, reference=reference, frame=frame)
+    tables = {
+        "reference": lin.placement[None],
+        "x0": form.x0[None],
+        "u0": lin.u0[None],
+        "K": form.gains,
+    }
+    return _law_of_states(title, policy, state, tables, form.grid, robot, dt=dt, lin=lin)
+
+
+def _law_of_states(
+    title: str,
+    policy: Policy,
+    state: StateMap,
+    tables: dict[str, Array],
+    axes: Mapping[str, Array],
+    robot: Robot,
+    *,
+    dt: float | None = None,
+    lin: LinearModel | None = None,
+) -> Law:
+    """Return the law with tables of K, x0, u0 and `reference`, whose gain may have a grid."""
+    dt = policy.sample_time if dt is None else dt
+    cases = list(_state_cases(state, bound(policy, robot), dt, tables, axes))
     tables["in_reference_axes"] = np.array(state.axes)
     tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
     if axes:
@@ -162,7 +209,11 @@ def _state_law(given: OfStates, robot: Robot) -> Law:
 
 
 def _state_cases(
-    state: StateMap, policy: Policy, dt: float, tables: dict[str, Array], axes: dict[str, Array]
+    state: StateMap,
+    policy: Command,
+    dt: float,
+    tables: dict[str, Array],
+    axes: Mapping[str, Array],
 ) -> Iterator[Case]:
     """Yield test cases at random states, with the results that the policy computes.
 
@@ -233,19 +284,35 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     }
 
 
-def _output_law(given: OfOutputs, robot: Robot) -> Law:
-    if isinstance(given, LinearController):
-        terms = given.terms()
-        lin = given.lin
-        inputs, signals = (lin.input_names, lin.input_units), (lin.output_names, lin.output_units)
-    else:
-        none, state = np.zeros((len(given.u0), len(given.y0))), StateMap(robot)
-        terms = Sample(given.A, given.B, given.C, none, given.u0, given.y0)
-        sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
-        known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
-        inputs = given.output_names, tuple(known.get(x, "unknown") for x in given.output_names)
-        signals = given.input_names, tuple(known.get(x, "unknown") for x in given.input_names)
-    if not given.dt and len(terms.A):
+def _compensator_law(given: Compensator, robot: Robot) -> Law:
+    """Convert a compensator, which contains no model; units are those of the robot's signals."""
+    none = np.zeros((len(given.u0), len(given.y0)))
+    state = StateMap(robot)
+    sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
+    known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
+    return _output_law(
+        type(given).__name__,
+        Sample(given.A, given.B, given.C, none, given.u0, given.y0),
+        inputs=(given.output_names, tuple(known.get(x, "unknown") for x in given.output_names)),
+        signals=(given.input_names, tuple(known.get(x, "unknown") for x in given.input_names)),
+        dt=given.dt,
+        robot=robot,
+        lin=None,
+    )
+
+
+def _output_law(
+    title: str,
+    terms: Sample,
+    *,
+    inputs: Signals,
+    signals: Signals,
+    dt: float,
+    robot: Robot,
+    lin: LinearModel | None,
+) -> Law:
+    """Return the law of a controller with constant matrices."""
+    if not dt and len(terms.A):
         raise InputError(
             "the controller is continuous, expected a sampled controller; use "
             "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
@@ -255,13 +322,13 @@ def _output_law(given: OfOutputs, robot: Robot) -> Law:
     tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")}
     tables |= {"u0": terms.u0[None], "continuous": continuous}
     return Law(
-        title=type(given).__name__,
+        title=title,
         state=None,
         signals=signals,
         inputs=inputs,
-        dt=given.dt,
+        dt=dt,
         robot=robot,
-        lin=getattr(given, "lin", None),
+        lin=lin,
         tables=tables,
         operations=float(len(terms.A) + len(signals[0]) + 16),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),

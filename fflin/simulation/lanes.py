@@ -16,9 +16,9 @@ from fflin.base.process import Progress
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, vector
 from fflin.control.channel import channel_of
-from fflin.control.linear_controller import LinearController, OutputFeedback
-from fflin.control.policies import Allocation, Gridded, Sample, StateFeedback, decider, measured_at
-from fflin.control.tracking import AT_THE_END, TrajectoryFeedback, TrajectoryOutputFeedback
+from fflin.control.policies import Sample, measured_at
+from fflin.control.policy import OutputForm, PathForm, StateForm
+from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there, without_numba
@@ -28,9 +28,6 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
 
-_OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
-OfOutputs: TypeAlias = LinearController | TrajectoryOutputFeedback
-_KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 # By default, a single run of more than LONG steps uses the compiled loop, if the machine code of
 # the loop is already stored.
 LONG = 20_000
@@ -58,25 +55,26 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
     plant = plan.plant
-    policy = decider(plan.policy)
+    policy = plan.policy.inner if plan.policy else None
     times = plan.times
-    designs = [plan.policy.design] if isinstance(plan.policy, Allocation) else []
+    design = plan.policy.commanded_robot if plan.policy else None
+    form = policy.form(design or plant.robot) if policy else None
     reason = ""
     if not numba_is_there():
         reason = without_numba()
     elif plan.events or plan.options.callback or plant.disturbance or plant.field:
         reason = "events, callbacks, disturbances and the field of an orbit are computed in Python"
-    elif not (policy is None or type(policy) in _KNOWN or isinstance(policy, Gridded)):
-        reason = f"a {type(policy).__name__} is computed in Python"
-    for robot in () if reason else (plant.robot, *designs):
+    elif policy is not None and form is None:
+        reason = f"a {policy.kind} is computed in Python"
+    for robot in () if reason else (plant.robot, *([design] if design else [])):
         at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         if batch_tree(robot) is None or not at_home:
             return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
-    if not reason and isinstance(policy, _OF_OUTPUTS):
-        dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
+    if not reason and policy and isinstance(form, OutputForm):
+        dt = form.loop.dt
         if dt and abs(times.sample * times.dt - dt) > 1e-6 * dt:
             return "its sample time differs from the compensator's"
-        if policy.noise is not None and not times.sample:
+        if policy.measurement_noise is not None and not times.sample:
             return "noise is evaluated at every stage of every step"
         try:
             measured_at(plant.state)
@@ -400,45 +398,50 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     inputs of the simulated robot.
     """
     asking = plan.plant
-    policy = decider(plan.policy)
     state = plan.plant.state
-    if isinstance(plan.policy, Allocation):
-        asking = Plant(StateMap(plan.policy.design, reference=state.reference, frame=state.frame))
+    form = None
+    if plan.policy:
+        if design := plan.policy.commanded_robot:
+            asking = Plant(StateMap(design, reference=state.reference, frame=state.frame))
+        form = plan.policy.inner.form(asking.robot)
     law = no_law(state, np.zeros(len(asking.actuation.names)))
     if asking is not plan.plant:
         law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))
-    if isinstance(policy, LinearController | TrajectoryOutputFeedback):
-        law = _filtered(law, plan, policy, asking)
-    elif isinstance(policy, TrajectoryFeedback):
-        law = law._replace(kind=policies.TRACK, path=_path(law.path, plan, policy, asking.state))
-    elif isinstance(policy, StateFeedback | Gridded):
-        law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx))
-        x0 = policy.lin.x0
-        if isinstance(policy, StateFeedback):
-            K, offset, x0 = policy.terms(state)
-            direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
-            law = law._replace(filter=direct)
-        else:
-            axes, gains = policy.table()
-            sizes = [len(values) for values in axes.values()]
-            grid = policies.Grid(
-                joint=[state.robot.joint_names.index(name) for name in axes],
-                first=np.cumsum([0, *sizes]),
-                values=np.concatenate(list(axes.values())),
-                stride=[np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))],
-                K=gains.ravel(),
-                offset=(policy.lin.u0 + gains @ policy.lin.x0).ravel(),
-                at=np.zeros(len(sizes)),
-            )
-            law = law._replace(grid=grid)
-        law = law._replace(near=x0[state.groups.q_m].copy())
+    if isinstance(form, OutputForm):
+        law = _filtered(law, plan, form, asking)
+    elif isinstance(form, PathForm):
+        path = _path(law.path, plan, form.policy, asking.state)
+        law = law._replace(kind=policies.TRACK, path=path)
+    elif isinstance(form, StateForm):
+        law = _linear(law, form, state)
     size = len(law.measured)
     slots = SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -> policies.Law:
-    """Return the law of the compensator `policy`.
+def _linear(law: policies.Law, form: StateForm, state: StateMap) -> policies.Law:
+    """Return the law of a state feedback, whose gain may be interpolated over a grid."""
+    near = form.x0[state.groups.q_m].copy()
+    law = law._replace(kind=policies.LINEAR, measured=np.arange(state.nx), near=near)
+    if not form.grid:
+        D = -form.gains[0].ravel()
+        direct = law.filter._replace(D=D, u0=form.offsets[0], y0=np.zeros(state.nx))
+        return law._replace(filter=direct)
+    sizes = [len(values) for values in form.grid.values()]
+    grid = policies.Grid(
+        joint=[state.robot.joint_names.index(name) for name in form.grid],
+        first=np.cumsum([0, *sizes]),
+        values=np.concatenate(list(form.grid.values())),
+        stride=[np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))],
+        K=form.gains.ravel(),
+        offset=form.offsets.ravel(),
+        at=np.zeros(len(sizes)),
+    )
+    return law._replace(grid=grid)
+
+
+def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) -> policies.Law:
+    """Return the law of a compensator.
 
     The law commands the inputs of the plant `asking`. Along a trajectory, the law contains the
     matrices of the compensator for each sample.
@@ -446,14 +449,14 @@ def _filtered(law: policies.Law, plan: Plan, policy: OfOutputs, asking: Plant) -
     state = asking.state
     times = plan.times
     rows = 1
-    loop = policy.bind(asking.robot)
-    if isinstance(policy, TrajectoryOutputFeedback):
-        rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
+    loop = form.loop
+    if form.samples:
+        rows = min(form.samples, -(-times.steps // times.sample))
     starts = [k * times.sample * times.dt for k in range(rows)]
     _, measures, near = zip(*map(loop.at, starts), strict=True)
     nz = len(loop.estimate)
     stages = 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(policy.terms, starts)]
+    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(form.terms, starts)]
     compensator = {
         key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
     }

@@ -24,9 +24,7 @@ from fflin.base.errors import ChartError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
-from fflin.control.linear_controller import LinearController, closed_loop
-from fflin.control.policies import Policy, decider, feedback_of
-from fflin.control.tracking import poles_along, tracking_of
+from fflin.control.policy import BoundLaw, Command, Policy
 from fflin.dynamics.integrators import CommutatorFree4, Integrator, integrated_hold
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
@@ -308,8 +306,8 @@ def shorter(h: float) -> float:
 
 def limits_of_step(
     plant: Plant,
-    policy: object,
-    commands: Policy | None,
+    policy: Policy | None,
+    commands: Command | None,
     q: Array,
     v: Array,
     u: Array,
@@ -326,13 +324,14 @@ def limits_of_step(
         limits.append(rotation(rate))
     if commands is None:
         return limits
-    tracking = tracking_of(policy)
-    if tracking is not None:
-        poles = np.zeros(0) if sample else poles_along(tracking.schedule)
+    assert policy is not None
+    trajectory = policy.followed_trajectory
+    if trajectory is not None:
+        poles = np.zeros(0) if sample else policy.poles_along()
         limits.append(Poles("loop along the trajectory", poles))
-        limits.append(rotation(_largest_rate(plant, tracking.trajectory.v)))
+        limits.append(rotation(_largest_rate(plant, trajectory.v)))
         return limits
-    linear = closed_loop(policy)
+    linear = policy.closed_loop()
     if sample:
         loop = _sampled_loop(policy, sample)
         return limits if loop is None else [*limits, loop]
@@ -340,7 +339,7 @@ def limits_of_step(
         loop_names = _loop_names(policy, len(linear[0]))
         limits.append(Poles.of(CLOSED_LOOP, linear[0], loop_names))
         return limits
-    if not (hasattr(commands, "advance") or plant.robot.orbit):
+    if not (isinstance(commands, BoundLaw) or plant.robot.orbit):
         # Infinite commands are accepted, because limits may clip them. NaN is refused.
         zero = np.zeros(len(plant.actuation.names))
         law = Law(commands, plant.actuation.names, (zero, zero), np.inf)
@@ -385,28 +384,24 @@ def _in_base_axes(plant: Plant, q: Array, u: Array) -> Array:
     return u
 
 
-def _loop_names(policy: object, count: int) -> tuple[str, ...]:
+def _loop_names(policy: Policy, count: int) -> tuple[str, ...]:
     """Return the names of the states of a closed loop with `count` states."""
-    lin, _ = feedback_of(policy)
+    lin = policy.model
     names = () if lin is None else lin.state_names
     return (*names, *(f"controller state {k}" for k in range(count - len(names))))
 
 
-def _sampled_loop(policy: object, sample: float) -> SampledLoop | None:
+def _sampled_loop(policy: Policy, sample: float) -> SampledLoop | None:
     """Return the sampled loop of a linear policy without delay, or None without a model."""
-    lin, K = feedback_of(policy)
+    lin = policy.model
     if lin is None:
         return None
     sampled = lin if lin.dt else lin.discretize(sample)
     generator = sampled.generator
     if generator is None or not np.isclose(sampled.dt, sample):
         return None
-    decides = decider(policy)
-    if isinstance(decides, LinearController):
-        return SampledLoop(sampled, generator, decides.sampled(sample).loop_around)
-    if K is None:
-        return None
-    return SampledLoop(sampled, generator, lambda model: model.A - model.B @ K)
+    loop = policy.loop_around(sample)
+    return None if loop is None else SampledLoop(sampled, generator, loop)
 
 
 def _derivatives(plant: Plant, law: Law, q: Array, v: Array) -> Array | None:

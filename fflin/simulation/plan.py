@@ -28,9 +28,9 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
-from fflin.control.linear_controller import closed_loop
-from fflin.control.policies import Feedback, axes_of, bound, decider, fed_back, feedback_of
-from fflin.control.tracking import followed, tracking_of
+from fflin.control.policies import Feedback
+from fflin.control.policy import Policy, bound
+from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
@@ -118,14 +118,14 @@ class Plan:
     def __init__(self, options: SimulationOptions) -> None:
         robot = instance("robot", options.robot, Robot, "a fflin.Robot; fflin.load makes one")
         self.events = _functions(options)
-        policy = followed(options.policy, robot)
+        policy = None if options.policy is None else prepared(options.policy, robot)
         self.options = options
         duration = duration_of(policy, options)
         state = _state_of(policy, options)
         self.plant = plant = Plant(state, options.disturbance)
         self.method = integrator(options.method)
-        (lin, _), follows = feedback_of(policy), getattr(decider(policy), "reference", None)
-        follows = follows if callable(follows) else None
+        lin = policy.model if policy else None
+        follows = policy.reference_motion if policy else None
         default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
         # Initial configuration (nq,) and velocity (nv,).
         self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)
@@ -142,8 +142,9 @@ class Plan:
             limits.append(Signal.of("the disturbance", disturbance, dt, duration))
         pace = Pace(limits, self.method, duration)
         self.times = times = times_of(options, duration, sample, pace)
-        policy = followed(policy, robot, held=times.sample * times.dt)
-        self.policy: object = policy
+        if policy and times.sample:
+            policy = policy.held_for(times.sample * times.dt)
+        self.policy = policy
         # `reference` is a function of time that returns q, v and u of the motion that the policy
         # follows, or None.
         self.reference = follows if options.target is None else None
@@ -183,13 +184,15 @@ class Plan:
         self.project = truth("project", options.project) and robot.orbit is None
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
-        self.steered = fed_back(policy)  # states that the policy feeds back, if known
+        self.steered = (
+            policy.fed_back if policy else ()
+        )  # states that the policy feeds back, if known
         # Function of time that returns the measurement noise; None if the policy defines no noise.
-        self.noise: Callable[[float], ArrayLike] | None = getattr(decider(policy), "noise", None)
+        self.noise = policy.measurement_noise if policy else None
         # Whether the run ends when the base leaves the attitude chart of the reference.
         self.within_chart = False
         # Time of the last stage of a step, as a fraction of the step; see _BEFORE.
-        self.last_node = 1.0 - _BEFORE if getattr(policy, "jumps", False) else 1.0
+        self.last_node = 1.0 - _BEFORE if policy and policy.jumps else 1.0
 
     def _final_velocity(self, goal: LinearModel | ArrayLike | None) -> Array:
         """Return the velocity (nv,) of the target at the end; the initial velocity if no target.
@@ -230,7 +233,7 @@ class Plan:
         return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
 
 
-def law_of(policy: object, plant: Plant, limits: Saturation, times: Times) -> Law | None:
+def law_of(policy: Policy | None, plant: Plant, limits: Saturation, times: Times) -> Law | None:
     """Return the policy, bound to the robot, as a law that checks commands; None if no policy."""
     if policy is None:
         return None
@@ -262,21 +265,21 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
     return state.to_state(target.q, target.v, near=near)
 
 
-def _state_of(policy: object, options: SimulationOptions) -> StateMap:
+def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
     """Return the state map of a motion.
 
     If the policy has a frame, the state map uses this frame, otherwise the frame in `options`. The
     same applies to the reference.
     """
     robot, frame, reference = options.robot, options.frame, options.reference
-    own_frame, own_reference = axes_of(policy)
+    own_frame, own_reference = policy.axes if policy else (None, None)
     other_frame = own_frame is not None and frame not in (None, own_frame)
     if other_frame or (own_reference is not None and reference is not None):
         raise InputError(
             f"frame={frame!r} or reference= is given, but the policy defines its own, with frame "
             f"'{own_frame}'; leave them out"
         )
-    if tracking_of(policy):
+    if policy and policy.followed_trajectory:
         refuse_orbit(robot, "trajectories to follow")
     if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
         made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")
@@ -305,59 +308,46 @@ def _functions(options: SimulationOptions) -> tuple[Event, ...]:
     return events
 
 
-def _inputs_at_start(policy: object, plant: Plant) -> Array:
+def _inputs_at_start(policy: Policy | None, plant: Plant) -> Array:
     """Return the reference inputs (nu,) of the policy at the start, or zeros if it has none."""
-    actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
-    # With an allocation, the policy's model has other inputs than the robot.
-    if lin is not None and lin.input_names == actuation.names:
-        return lin.u0
-    if along is not None and along is policy:
-        return along.reference(0.0)[2]
-    of_code: Array | None = getattr(policy, "initial_inputs", None)  # C code contains no model
-    return np.zeros(len(actuation.names)) if of_code is None else of_code
+    names = plant.actuation.names
+    initial = policy.initial_inputs_for(names) if policy else None
+    return np.zeros(len(names)) if initial is None else initial
 
 
-def _warn_beyond_limits(policy: object, plant: Plant, limits: Saturation) -> None:
+def _warn_beyond_limits(policy: Policy | None, plant: Plant, limits: Saturation) -> None:
     """Warn if the reference inputs of a policy exceed the limits.
 
     If the policy follows a trajectory, warn if its inputs exceed the limits at any time.
     """
-    actuation, (lin, _), along = plant.actuation, feedback_of(policy), tracking_of(policy)
-    own = getattr(policy, "initial_inputs", None)  # of C code, which contains no model
-    if lin is not None and lin.input_names == actuation.names:
-        where = "at its target"
-        inputs = lin.u0[None]
-    elif along is not None and along is policy:
-        where = "on its trajectory"
-        inputs = along.trajectory.u_base
-    elif own is not None:
-        where = "at its target"
-        inputs = own[None]
-    else:
+    actuation = plant.actuation
+    known = policy.reference_inputs(actuation.names) if policy else None
+    if known is None:
         return
+    where, inputs = known
     units = dict(zip(actuation.names, actuation.units, strict=True))
     warn_beyond(plant.robot.name, where, units, inputs, limits.low, limits.high)
 
 
-def duration_of(policy: object, options: SimulationOptions) -> float:
+def duration_of(policy: Policy | None, options: SimulationOptions) -> float:
     """Return the duration [s]; by default the duration of the followed trajectory."""
     duration = options.duration
-    follows = tracking_of(policy)
-    if duration is None and follows is None:
-        raise InputError("the duration is missing; give duration= in s")
-    return _positive("duration", follows.duration if follows and duration is None else duration)
+    if duration is None:
+        trajectory = policy.followed_trajectory if policy else None
+        if trajectory is None:
+            raise InputError("the duration is missing; give duration= in s")
+        duration = float(trajectory.t[-1] - trajectory.t[0])
+    return _positive("duration", duration)
 
 
-def sample_of(policy: object, sample: float | None) -> float | None:
+def sample_of(policy: Policy | None, sample: float | None) -> float | None:
     """Return the sample time [s] of a policy, or None if the policy is continuous.
 
     The argument `sample` takes precedence over the sample time of the policy.
     """
     if sample is not None:
         return _positive("sample", sample)
-    follows, by = tracking_of(policy), decider(policy)
-    made = by if hasattr(by, "dt") else getattr(by, "lin", None)
-    return getattr(follows.schedule if follows else made, "dt", None) or None
+    return (policy.sample_time or None) if policy else None
 
 
 def step_of(
@@ -498,7 +488,7 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     SHORTEST. If the loop does not settle before LONGEST, return SHORTEST.
     """
     lin = policy.lin
-    closed = closed_loop(policy)
+    closed = policy.closed_loop()
     _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
     assert closed is not None
     loop, dt = closed
@@ -512,7 +502,7 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     away = np.zeros(len(history), dtype=bool)
     wheels = {f"q_m.{name}" for name in lin.wheels}
     for group in ("q_b", "r_b", "q_m"):
-        judged = {name for name in fed_back(policy) if group_of(name) == group} - wheels
+        judged = {name for name in policy.fed_back if group_of(name) == group} - wheels
         of = [i for i, name in enumerate(lin.state_names) if name in judged]
         error = np.abs(history[:, of]).max(axis=1, initial=0.0)
         away |= error > 0.01 * error.max()

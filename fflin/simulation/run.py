@@ -24,6 +24,7 @@ from fflin.base.names import by_name
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, ArrayLike, as_double, dimension, number, vector
+from fflin.control.policy import BoundLaw
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
 from fflin.dynamics.integrals import integrals
@@ -378,7 +379,8 @@ def _follower(plan: Plan) -> Callable[[int], None] | None:
 
     The argument is the number of stages of the present step that are computed.
     """
-    advance = getattr(plan.law.policy, "advance", None) if plan.law else None
+    command = plan.law.policy if plan.law else None
+    advance = command.advance if isinstance(command, BoundLaw) else None
     if advance is None:
         return None
     weights = plan.method.step_weights(plan.times.dt)[1]

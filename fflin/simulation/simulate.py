@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from time import perf_counter
-from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -17,8 +16,7 @@ from fflin.base.names import group_of
 from fflin.base.process import LONG_RUN
 from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
-from fflin.control.linear_controller import LinearController, growing
-from fflin.control.policies import Policy, StateFeedback, axes_of, feedback_of
+from fflin.control.policy import BoundLaw, Command, Policy, Predictor
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame, state_history
 from fflin.dynamics.integrators import held_exponential
@@ -30,11 +28,6 @@ from fflin.simulation.lanes import engine_of, not_compilable, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.run import Conserved, Disturbance, Recording, go
-
-# Linear model that predicts a motion, and a function that returns the command (nu,) for a deviation
-# from the operating point. The deviation contains the states of the robot. If the controller is in
-# continuous time and has states, the deviation also contains these states, at the end.
-Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
 
 # After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
 # compiled loop takes about the fraction _FRACTION of the time in Python. It must be compiled once,
@@ -61,7 +54,7 @@ _log = logging.getLogger("fflin")
 
 def simulate(
     robot: Robot,
-    policy: Policy | StateFeedback | GainSchedule | object = None,
+    policy: Policy | GainSchedule | Command | None = None,
     *,
     x0: ArrayLike | None = None,
     q0: ArrayLike | None = None,
@@ -295,7 +288,9 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     if foresees is not None and beyond is None:
         prediction = predict(plan, foresees, x, run.steps)
     energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
-    policies = plan.policy, plan.law and plan.law.policy
+    notes = plan.policy.notes if plan.policy else ()
+    if plan.law and isinstance(plan.law.policy, BoundLaw):
+        notes += plan.law.policy.notes
     limits = limits_of(plan.options.robot) | plan.acting
     missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
     drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
@@ -332,10 +327,10 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         mode_rotations=np.array([*map(attrgetter("rotation"), robot.modes)]),
         steered=plan.steered,
         notes=(
-            *growing(plan.policy, plan.times.sample * plan.times.dt),
+            *(plan.policy.loop_notes(plan.times.sample * plan.times.dt) if plan.policy else ()),
             *plan.times.notes,
             *_energy_note(plan, run, energy, float(scale[0])),
-            *dict.fromkeys(note for each in policies for note in getattr(each, "notes", ())),
+            *dict.fromkeys(notes),
             *half_turn_notes(plan, beyond, predicted=foresees is not None),
         ),
         limit_names=tuple(limits),
@@ -388,9 +383,10 @@ def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> lis
         return []
     clauses = list[str]()
     steered = "q_b" in map(group_of, plan.steered)
-    if not plan.steered and feedback_of(plan.policy)[0] is None:
+    policy = plan.policy
+    if policy and not plan.steered and policy.model is None:
         # C code does not say which states it feeds back. A function has no reference.
-        steered = axes_of(plan.policy)[1] is not None
+        steered = policy.axes[1] is not None
     if steered:
         clauses.append("the law continued with the shorter rotation")
     if predicted:
@@ -408,14 +404,13 @@ def predictor(plan: Plan) -> Predictor | None:
     The predictor uses the model in the option `linear`, or by default the model of the policy.
     """
     linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
-    own, _ = feedback_of(policy)
-    lin = own
+    lin = policy.model if policy else None
     if not (linear is None or isinstance(linear, bool | np.bool_)):
         lin = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
         names = (state.names, plan.plant.actuation.names, state.frame)
         same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
-        if isinstance(policy, LinearController):
-            same = same and lin.output_names == policy.lin.output_names
+        if policy and policy.senses_outputs:
+            same = same and lin.output_names == policy.sensors
         if not same or not lin.reference.isApprox(state.reference, 1e-9):
             raise InputError(
                 f"linear is a model of '{lin.robot}' with other states, inputs, frame or "
@@ -425,34 +420,18 @@ def predictor(plan: Plan) -> Predictor | None:
     elif linear is not None and not linear:
         return None
     if lin is not None and lin.state_names == state.names:
-        if isinstance(policy, LinearController) and policy.dt:
-            by = policy.terms()
-            model = lin
-            z: Array = np.zeros(len(by.A))
-
-            def command(e: Array) -> Array:
-                nonlocal z
-                u, z = by.step(z, lambda u: model.y0 + model.C @ e + model.D @ (u - model.u0))
-                return u
-
-            return lin, command
-        if isinstance(policy, LinearController):
-            both, gains, offset = policy.around(lin)
-            return both, lambda e: offset + gains @ e
         if policy is None:
             none = np.zeros(len(lin.u0))
             return lin, lambda _: none
-        gain = getattr(policy, "K", None)  # an allocation is nonlinear and has no gain
-        if own is not None and gain is not None:
-            K, constant, _ = StateFeedback(own, gain).terms(state)
-            at_point = constant - K @ lin.x0
-            return lin, lambda e: at_point - K @ e
+        predicted = policy.prediction(lin, state)
+        if predicted is not None:
+            return predicted
     if linear is None:
         return None
     raise InputError(
         "linear= is given, but this model cannot predict a motion with a policy of type "
-        f"{type(policy).__name__}; leave linear= out, or give the full model of a StateFeedback, "
-        "an OutputFeedback, a LinearController or no policy"
+        f"{policy.kind if policy else None}; leave linear= out, or give the full model of a "
+        "StateFeedback, an OutputFeedback, a LinearController or no policy"
     )
 
 

@@ -325,12 +325,13 @@ def test_a_policy_of_the_user_can_follow_a_reference():
     robot = fflin.load("planar_detumble")
     q, v = fflin.configuration(robot, {"joint_1": 0.2}), np.zeros(robot.nv)
 
-    class Following:
-        def reference(self, t):
-            return q, v, np.zeros(9)
+    class Following(fflin.Policy):
+        @property
+        def reference_motion(self):
+            return lambda t: (q, v, np.zeros(9))
 
-        def __call__(self, t, q, v):
-            return np.zeros(9)
+        def bind(self, robot):
+            return lambda t, q, v: np.zeros(9)
 
     motion = fflin.simulate(robot, Following(), duration=0.5)
     assert (motion.q[0] == q).all() and motion.tracked

@@ -1,0 +1,384 @@
+"""Base class of policies: what simulations, campaigns and C code ask of a control law."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from itertools import compress
+from types import BuiltinFunctionType, FunctionType
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, ArrayLike, Mask, function
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from fflin.dynamics.coordinates import Frame
+    from fflin.dynamics.state import StateMap
+    from fflin.linear.trajectory import Trajectory
+
+# Function of time t [s], configuration q and velocity v that returns the inputs u (nu,).
+Command: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+# Function of time that returns measurement noise, one value for each sensor.
+Noise: TypeAlias = Callable[[float], ArrayLike]
+
+# Linear model that predicts a motion, and a function that returns the command (nu,) for a deviation
+# from the operating point. The deviation contains the states of the robot. If the controller is in
+# continuous time and has states, the deviation also contains these states, at the end.
+Predictor: TypeAlias = tuple[LinearModel, Callable[[Array], Array]]
+
+# Function of time that returns the q, v and u that a policy follows; u is in base axes.
+Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
+
+# A pole counts as unstable if its real part, or |z| - 1 for a sampled system, exceeds
+# _ROUNDING * (1 + largest pole magnitude).
+_ROUNDING = 1e-6
+
+# Functions have no memory of their own that could be copied.
+_FUNCTIONS = FunctionType, BuiltinFunctionType
+
+
+class StateForm(NamedTuple):
+    """Data of the law u = offset - K x of a robot's full state x.
+
+    K may depend on joint positions. `grid` contains {joint: values} of its grid, or is empty.
+    `gains` (N, nu, nx) and `offsets` (N, nu) contain K and the offset at the points of the grid.
+    Angles of continuous joints are unwrapped near the state `x0` (nx,).
+    """
+
+    offsets: Array
+    gains: Array
+    x0: Array
+    grid: Mapping[str, Array]
+
+
+class OutputForm(NamedTuple):
+    """Data of a law that computes commands from measured outputs."""
+
+    loop: Any  # the bound law, a `policies.Loop`
+    terms: Callable[[float], Any]  # `policies.Sample` at a time [s]
+    samples: int | None  # number of different samples from t = 0 on; None if all are the same
+
+
+class PathForm(NamedTuple):
+    """Data of a state feedback along a trajectory."""
+
+    policy: Any  # a `tracking.TrajectoryFeedback`
+
+
+Form: TypeAlias = StateForm | OutputForm | PathForm
+
+
+class Policy(ABC):
+    """Base class of control laws for `simulate`, `monte_carlo` and the other functions.
+
+    A subclass must define `bind`. All other members have defaults, with which a law works in
+    simulations and campaigns. A law that overrides them gets more: the default step follows from
+    `closed_loop`, reports judge the states in `fed_back`, and `form` lets the compiled loop fly the
+    law. A subclass that redefines `bind` without `form` is computed in Python.
+
+    A plain function policy(t, q, v) -> u is also accepted wherever a policy is.
+
+    Examples
+    --------
+    An integrator whose state stops at the limit of the torque:
+
+    >>> class PI(fflin.Policy):
+    ...     def __init__(self, lin, K, rate, most):
+    ...         self.lin, self.K, self.rate, self.most = lin, K, rate, most
+    ...     model = property(lambda self: self.lin)
+    ...     sample_time = 0.1
+    ...     def bind(self, robot):
+    ...         feedback = fflin.StateFeedback(self.lin, self.K).bind(robot)
+    ...         state = fflin.StateMap(robot, frame=self.lin.frame)
+    ...         integral = np.zeros(3)
+    ...         def command(t, q, v):
+    ...             u = feedback(t, q, v)
+    ...             u[:3] -= integral
+    ...             if np.abs(u[:3]).max() < self.most:  # otherwise the integral would wind up
+    ...                 integral[:] += 0.1 * self.rate * state.to_state(q, v)[:3]
+    ...             return u
+    ...         return command
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> law = PI(lin, fflin.lqr(lin).K, 0.05, 2.0)
+    >>> fflin.simulate(robot, law, duration=1.0).u.shape[1]
+    9
+    """
+
+    # Whether the sensors of the law are the outputs of the robot, and not its states.
+    senses_outputs: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        # Inherited data do not describe a law that binds itself in another way.
+        if "bind" in vars(cls) and "form" not in vars(cls):
+            cls.form = Policy.form  # type: ignore[method-assign]
+
+    @abstractmethod
+    def bind(self, robot: Robot) -> Command:
+        """Return policy(t, q, v) -> u for a robot; each call returns one with its own memory."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the type of law, for messages."""
+        return type(self).__name__
+
+    @property
+    def model(self) -> LinearModel | None:
+        """Linear model about whose operating point the law acts; None if there is none."""
+        return None
+
+    @property
+    def feedback_gain(self) -> Array | None:
+        """Gain K (nu, nx) of the states of `model`; None if the law is no constant gain."""
+        return None
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s]; 0 for continuous commands."""
+        return 0.0 if self.model is None else self.model.dt
+
+    @property
+    def measurement_noise(self) -> Noise | None:
+        """Function of time that returns the measurement noise, or None."""
+        return None
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the measured signals; empty if the law has no sensors that could have errors."""
+        return ()
+
+    @property
+    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
+        """Frame and reference of the states; each is None if the law leaves it open."""
+        if self.model is None:
+            return None, None
+        return self.model.frame, self.model.reference
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the command of a continuous law jumps at instants between the steps."""
+        return False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks for the report of a motion."""
+        return ()
+
+    @property
+    def inner(self) -> Policy:
+        """The law that decides; it differs from this one for an allocation."""
+        return self
+
+    @property
+    def commanded_robot(self) -> Robot | None:
+        """Robot whose inputs `inner` commands, if it is not the simulated one."""
+        return None
+
+    @property
+    def reference_motion(self) -> Reference | None:
+        """Function of time that returns q, v and u of the motion that the law follows, or None."""
+        return None
+
+    @property
+    def followed_trajectory(self) -> Trajectory | None:
+        """Trajectory that the law follows, or None."""
+        return None
+
+    @property
+    def fed_back(self) -> tuple[str, ...]:
+        """Names of the states that the law feeds back, or () if they are unknown."""
+        if self.model is None:
+            return ()
+        names = self.model.state_names
+        K = self.feedback_gain
+        return names if K is None else states_of_gain(names, K)
+
+    def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
+        """Return the reference inputs at the start, or None if the law has none.
+
+        `names` are the inputs of the robot. An allocation commands others.
+        """
+        lin = self.model
+        return lin.u0 if lin is not None and lin.input_names == names else None
+
+    def reference_inputs(self, names: tuple[str, ...]) -> tuple[str, Array] | None:
+        """Return where the law has reference inputs, and these inputs (N, nu), or None."""
+        initial = self.initial_inputs_for(names)
+        return None if initial is None else ("at its target", initial[None])
+
+    def held_for(self, seconds: float) -> Policy:
+        """Return the law for commands that are held for some seconds."""
+        return self
+
+    def fresh(self) -> Policy:
+        """Return the law for one more run; `bind` gives it its own memory."""
+        return self
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the law with errors (ny,) at time t added to the values of its `sensors`."""
+        raise InputError(f"a {type(self).__name__} has no sensors")
+
+    def closed_loop(self) -> tuple[Array, float] | None:
+        """Return the matrix of the linear closed loop and its dt [s], or None if it has none."""
+        lin = self.model
+        K = self.feedback_gain
+        return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt)
+
+    def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
+        """Return a function from a sampled model to the matrix of its closed loop, or None.
+
+        `sample` is the sampling time [s].
+        """
+        K = self.feedback_gain
+        return None if K is None else lambda model: model.A - model.B @ K
+
+    def poles_along(self) -> Array:
+        """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""
+        return np.zeros(0)
+
+    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
+        """Return the predictor of the closed loop with the model `lin`, or None.
+
+        `lin` has the states of `state`.
+        """
+        return None
+
+    def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
+        """Return notes on unstable poles of the linear loop.
+
+        `held` is the time [s] for which commands are held; 0 if the law is continuous.
+        """
+        lin = self.model
+        K = self.feedback_gain
+        if lin is None or K is None:
+            return ()
+        loop = lin.A - lin.B @ K
+        unstable = unstable_note("linear loop", loop[_on_feedback(loop, K)], lin.dt, "")
+        if unstable or lin.dt or not held:
+            return unstable
+        sampled = lin.discretize(held)
+        advice = (
+            f"; the gain was designed in continuous time, but its commands are held for {held:g} "
+            "s: shorten the sample time, or design the gain for it "
+            f"(lin.discretize({held:g}))"
+        )
+        loop = sampled.A - sampled.B @ K
+        return unstable_note("sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice)
+
+    def form(self, robot: Robot) -> Form | None:
+        """Return the law as data for the compiled loop; None if it is computed in Python."""
+        return None
+
+
+class BoundLaw(ABC):
+    """Command of a law with memory or with remarks on a run."""
+
+    # Moves the memory of a continuous law by a stage of the integrator, see `Loop.advance`.
+    advance: Callable[[Array, bool], None] | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks for the report of a motion."""
+        return ()
+
+    @abstractmethod
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the inputs (nu,)."""
+
+
+@dataclass(eq=False)
+class FunctionPolicy(Policy):
+    """Policy that is a function of t, q and v, or an object with a method `bind`."""
+
+    given: Any
+
+    def __post_init__(self) -> None:
+        if not (callable(self.given) or callable(getattr(self.given, "bind", None))):
+            raise InputError(
+                f"policy has type {type(self.given).__name__}, expected policy(t, q, v) -> u, such "
+                "as StateFeedback(lin, gain.K)"
+            )
+
+    @property
+    def kind(self) -> str:
+        """Name of the type of the function or object."""
+        return type(self.given).__name__
+
+    def bind(self, robot: Robot) -> Command:
+        """Return the function, or what the method `bind` of the object returns."""
+        given = self.given
+        command: Command = given.bind(robot) if hasattr(given, "bind") else given
+        return command
+
+    def fresh(self) -> Policy:
+        """Return a copy without the memory of an earlier run.
+
+        The method `reset` of the copy is called if it has one. Functions are not copied.
+        """
+        given = self.given
+        if hasattr(given, "bind") or isinstance(given, _FUNCTIONS):
+            return self
+        try:
+            copied = deepcopy(given)
+        except TypeError:  # it holds something that cannot be copied, such as a lock
+            copied = given
+        reset = getattr(copied, "reset", None)
+        if callable(reset):
+            reset()
+        return FunctionPolicy(copied)
+
+
+def as_policy(given: object) -> Policy:
+    """Return a policy; raise `InputError` if the object is neither a policy nor a function."""
+    return given if isinstance(given, Policy) else FunctionPolicy(given)
+
+
+def bound(policy: object, robot: Robot) -> Command:
+    """Return the command function of a policy for a robot."""
+    law = as_policy(policy)
+    command = law.bind(robot)
+    if not callable(command):
+        raise InputError(
+            f"policy has type {law.kind}, expected policy(t, q, v) -> u, such as "
+            "StateFeedback(lin, gain.K)"
+        )
+    function("policy", command, "(t, q, v)")
+    return command
+
+
+def states_of_gain(names: tuple[str, ...], K: Array) -> tuple[str, ...]:
+    """Return the names of the states that a gain K (.., nu, nx) feeds back."""
+    largest = np.abs(K).reshape(-1, K.shape[-1]).max(axis=0, initial=0.0)
+    return tuple(compress(names, largest))
+
+
+def unstable_note(what: str, matrix: Array, dt: float, advice: str) -> tuple[str, ...]:
+    """Return a note if a pole of `matrix` (n, n) is unstable; dt [s] is 0 in continuous time."""
+    poles = np.linalg.eigvals(matrix)
+    growth = np.abs(poles) - 1.0 if dt else poles.real
+    if not (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
+        return ()
+    pole = complex(poles[growth.argmax()])
+    unit = "" if dt else " 1/s"
+    return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
+
+
+def _on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
+    """Return rows and columns of the states that affect the states that the gain K feeds back.
+
+    Other states, such as the position of a base that no input pushes, may drift in a stable loop.
+    """
+    acting = K.any(axis=0)
+    for _ in A:
+        acting = acting | A[acting].any(axis=0)
+    return np.ix_(acting, acting)
