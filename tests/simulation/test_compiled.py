@@ -99,7 +99,7 @@ def test_forces_of_all_kinds(fields):
     K = 0.05 * np.random.default_rng(1).normal(size=lin.B.shape[::-1])
     policy = fflin.StateFeedback(lin, K)
     # Under gravity, this loop diverges after some seconds, and rounding errors grow with it.
-    both(robot, policy, x0=displaced(lin), duration=2.0)
+    both(robot, policy, x0=displaced(lin), duration=1.5)
 
 
 def test_mimic_joints(tmp_path):
