@@ -101,7 +101,7 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     for j, name in enumerate(columns):
         if not values[:, j].any():
             continue
-        size = len(_GAP) + max(len(name), *(len(row[j]) for row in text))
+        size = len(_GAP) + max([len(name)] + [len(row[j]) for row in text])
         if not folds or used + size > width():
             folds.append([])
             used = label

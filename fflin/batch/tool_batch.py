@@ -128,10 +128,12 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
     vectors = [kind.vectors(q, v) for q, v in zip(batch.q, batch.v, strict=True)]
     q, v = (np.array(each) for each in zip(*vectors, strict=True))
     positions = np.zeros_like(v) if kind.tangent else q
+    for stack in stacks.values():
+        frozen(stack)
     return ToolBatch(
         tool=tool,
         robot=batch.robot,
-        **{name: frozen(value) for name, value in stacks.items()},
+        **stacks,
         x0=frozen(np.hstack((positions, v))),
         q=frozen(q),
         v=frozen(v),

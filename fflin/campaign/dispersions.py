@@ -401,7 +401,10 @@ class Dispersions:
                 policy = _Bound(policy, plant.robot)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
-        own = None if faults is None else ActuatorFaults(*(x[0] for x in faults))
+        own = None
+        if faults is not None:
+            first = [values[0] for values in faults]
+            own = ActuatorFaults(*first)
         return Plant(state, plant.disturbance, own), policy, q[0], v[0]
 
 

@@ -130,7 +130,8 @@ def integrals(robot: Robot, q: Array, v: Array) -> Integrals:
     for first in range(0, len(q), _ROWS):
         rows = slice(first, first + _ROWS)
         parts.append(_sums(robot, bodies, np.array(q[rows].T), np.array(v[rows].T)))
-    return Integrals(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    whole = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    return Integrals(*whole)
 
 
 @lru_cache(maxsize=16)  # robots do not change

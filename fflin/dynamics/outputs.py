@@ -33,7 +33,8 @@ class Sensed(NamedTuple):
 
     def part(self, rows: slice) -> Sensed:
         """Return views of some rows, such as the rows of one output."""
-        return Sensed(*(each[rows] for each in self))
+        views = [each[rows] for each in self]
+        return Sensed(*views)
 
 
 class Point(NamedTuple):

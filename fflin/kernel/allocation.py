@@ -152,12 +152,13 @@ def least_squares(least: Entries, most: Entries, size: int) -> LeastSquares:
     lengths |= dict.fromkeys(("columns", "A"), (count + 1) * size)
     lengths |= {"Q": count * (size + count), "R": count * count}
     lengths |= {"b": size + count, "wanted": size}
+    zeros = {name: np.zeros(length) for name, length in lengths.items()}
     return empty(LEAST_SQUARES)._replace(
         least=least,
         most=most,
         state=np.zeros(count, dtype=np.intp),
         order=np.zeros(count, dtype=np.intp),
-        **{name: np.zeros(length) for name, length in lengths.items()},
+        **zeros,
     )
 
 
@@ -385,7 +386,10 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
         columns=np.concatenate((A.T.ravel(), b)),
         state=[0] * len(least),
         order=[0] * len(least),
-        **{name: numbers.copy() for name in ("x", "s", "low", "high")},
+        x=numbers.copy(),
+        s=numbers.copy(),
+        low=numbers.copy(),
+        high=numbers.copy(),
     )
     solve(problem, size, 0)
     return np.array(problem.x)

@@ -105,7 +105,8 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
     for signal in _SIGNALS:
         vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
         keys = (f"{signal}_names", f"{signal}_units", *vectors)
-        lines = zip(*(np.asarray(rest.pop(key)).tolist() for key in keys), strict=True)
+        columns = [np.asarray(rest.pop(key)).tolist() for key in keys]
+        lines = zip(*columns, strict=True)
         tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
     tables["info"] = [["name", "value"]]
     for key, value in rest.items():

@@ -360,9 +360,10 @@ def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tupl
     heavy_light = np.stack((nodes, nodes[:, ::-1]), axis=2).reshape(-1, 2)
     maps = np.concatenate(held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1)
     ends = np.cumsum([2 * len(each) for each in start])[:-1]
-    rows = zip(*(np.split(x, ends) for x in (mixed, h, maps, heavy_light)), strict=True)
+    columns = [np.split(each, ends) for each in (mixed, h, maps, heavy_light)]
     found = list[tuple[Steps, Array]]()
-    for steps in (Steps(*each) for each in rows):
+    for row in zip(*columns, strict=True):
+        steps = Steps(*row)
         whole = np.eye(nx + nu)
         for step in steps.maps:
             whole[:nx] = step @ whole

@@ -301,7 +301,8 @@ class Motion(StatesAndInputs, Design):
                 name = event or part.robot
                 other = part._robot
                 first_row = [part.q[0], part.v[0]]
-            seen, rates = _seen(robot, other, q, *(each[None] for each in first_row))
+            first_q, first_v = first_row
+            seen, rates = _seen(robot, other, q, first_q[None], first_v[None])
             apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
             if apart.max() > _MET * max(1.0, np.abs(v).max()):
                 at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())

@@ -245,5 +245,6 @@ def _draw_drifts(axes: Axes, motion: Motion) -> None:
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
         axes.semilogy(motion.t, drift, color=color, label=label)
     axes.set(title=f"relative {next(iter(shown))} drift", xlabel="t [s]")
-    axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
+    largest = [float(drift.max()) for drift in shown.values()]
+    axes.set_ylim(1e-17, max(1e-13, 10.0 * max(largest)))
     axes.legend(handlelength=1.2)

@@ -150,7 +150,8 @@ class ModelDerivatives:
 
         def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:
             change_bodies(other.model, self.robot.model, one, size)
-            moved = AccelerationDerivatives(*(a + size * b for a, b in zip(now, by, strict=True)))
+            changed = [a + size * b for a, b in zip(now, by, strict=True)]
+            moved = AccelerationDerivatives(*changed)
             made = output_equations(sensing, actuation, data, self._chart, moved, lin.x0, point)
             seen: Array = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
             total: float = pin.computeTotalMass(other.model)

@@ -117,7 +117,8 @@ class Sensitivity:
         """Return the derivatives with respect to one parameter."""
         one = self._one(name)
         matrices = self._derivatives.over([one])
-        return Derivatives(one.name, one.unit, one.value, *(x[0] for x in matrices))
+        first = [each[0] for each in matrices]
+        return Derivatives(one.name, one.unit, one.value, *first)
 
     def _one(self, name: str) -> Parameter:
         found = self.parameters.find(name)

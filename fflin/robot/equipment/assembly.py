@@ -17,7 +17,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -119,9 +119,16 @@ def equipped(
             fields[name] |= item.springs[name]
     # Remember only the names of removed wheels and modes. All other removed joints were locked.
     removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
+    changed: dict[str, Any] = {
+        **fields,
+        "model": model,
+        "joints": joints,
+        "followers": followers,
+        "inputs": checked,
+    }
     return replace(
         robot,
-        **{"model": model, "joints": joints, "followers": followers, "inputs": checked, **fields},
+        **changed,
         links=bare.links,
         urdf_sha256=bare.urdf_sha256,
         appendages=items,
