@@ -46,7 +46,7 @@ def arm(robots):
 
 @pytest.fixture(scope="module")
 def found(arm):
-    return fflin.funnel(*arm, {"attitude": 5.0, "joints": 0.1}, knots=3, samples=16, dt=0.05)
+    return fflin.funnel(*arm, {"attitude": 5.0, "joints": 0.1}, knots=3, samples=8, dt=0.05)
 
 
 def passage(still, schedule, t):
@@ -139,7 +139,7 @@ def test_what_is_sure_is_so_in_as_many_cases_as_it_says(still, schedule):
 def test_it_is_the_same_whoever_does_it(arm, found):
     robot, schedule = arm
     goal = {"attitude": 5.0, "joints": 0.1}
-    options = {"knots": 3, "samples": 16, "dt": 0.05}
+    options = {"knots": 3, "samples": 8, "dt": 0.05}
     pytest.importorskip("numba")
     told = []
     compiled = fflin.funnel(*arm, goal, **options, engine="compiled")

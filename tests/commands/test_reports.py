@@ -79,6 +79,7 @@ def test_a_report_of_a_trajectory_and_of_many_runs_is_too(robot, tmp_path):
         judge(out, command, words)
 
 
+@pytest.mark.exhaustive
 def test_the_list_of_robots_begins_with_how_many_load():
     lines = run("robots")[1].splitlines()
     assert re.fullmatch(r"robots: \d+ robots can be loaded by name; 1 cannot be loaded", lines[0])
