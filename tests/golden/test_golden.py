@@ -10,7 +10,7 @@ from tests.support.robots import mostly
 # Each policy has a quick case with another robot.
 LONG = [case for case in cases() if case.startswith("policies") and case.endswith("ets_vii")]
 LONG += ["policies controlled cubesat", "policies controlled_in_samples cubesat"]
-LONG += ["policies shared cubesat", "funnel", "validity"]
+LONG += ["policies shared cubesat", "campaign", "funnel", "validity"]
 QUICK = [case for case in cases() if case not in LONG]
 COMPILED = [case for case in cases() if not case.startswith("models")]
 
