@@ -15,7 +15,7 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 # Examples that fly many runs or search long.
 LONG = {"plot_funnel", "Funnel", "funnel", "plan", "plot_validity", "validity", "Validity"}
-LONG |= {"plot_campaign"}
+LONG |= {"plot_campaign", "monte_carlo"}
 COMPILED = {"CLaw"}  # examples that call a C compiler
 NAMES = [
     *(name for name in fflin.__all__ if name not in LONG | COMPILED),

@@ -24,17 +24,32 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The folder that FFLIN_SITE says was built already, or one that is built here."""
+    """The folder that FFLIN_SITE says was built already, or one that is built here.
+
+    All workers of a run share one site: the first one builds it, and the others wait.
+    """
     if built := os.environ.get("FFLIN_SITE"):
         return Path(built).resolve()
-    for package in ("sphinx", "myst_nb", "numpydoc", "furo"):
+    for package in ("sphinx", "myst_nb", "numpydoc", "furo", "filelock"):
         pytest.importorskip(package, reason="the extra docs is not installed")
-    folder = tmp_path_factory.mktemp("site") / "site"
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "docs", folder]
+    from filelock import FileLock
+
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "site"
+    with FileLock(f"{folder}.lock"):
+        if not (folder / "index.html").exists():
+            _build(folder)
+    return folder
+
+
+def _build(folder):
+    """Build the site in another folder, and move it to its place when it is complete."""
+    part = folder.with_suffix(".part")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "docs", part]
     # Where the kernels are not compiled yet, that takes a processor some minutes.
     done = finished(command, cwd=ROOT, capture_output=True, text=True, watch={"limit": 1200.0})
     assert done.returncode == 0, done.stderr
-    return folder
+    part.rename(folder)
 
 
 class Page(HTMLParser):

@@ -38,9 +38,9 @@ _ARGUMENTS = (
 # this process. When this process ends, the pipes are closed, and Chromium exits.
 _WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
-# Time limit of a browser [s], to which 3 s are added for each picture. The limit is long enough for
-# a slow machine without a graphics card.
-_PATIENCE = 120.0
+# Time limit of a browser [s], and the time added for each picture [s]. They are long enough for a
+# slow machine without a graphics card.
+_PATIENCE, _PER_PICTURE = 120.0, 3.0
 
 # Sizes [px] of a single picture of the whole page, of a picture in a strip, and of a GIF.
 _PICTURE, _STRIP, _GIF = (1280, 720), (640, 480), (640, 400)
@@ -98,7 +98,7 @@ def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -
     """
     program = find_chromium()
     try:
-        with _browser(program, _PATIENCE + 3.0 * len(times)) as (browser, folder):
+        with _browser(program, _PATIENCE + _PER_PICTURE * len(times)) as (browser, folder):
             file = Path(folder, "page.html")
             file.write_text(page, encoding="utf-8")
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.support.robots import BUNDLED
+from tests.support.robots import BUNDLED, mostly
 from tests.support.sweeps import points
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", mostly(BUNDLED, "cubesat", "planar_detumble", "ets_vii"))
 def test_every_gain_is_that_of_lqr(name, robots):
     robot = robots[name]
     batch = fflin.sweep(robot, points(robot, 6)[0])

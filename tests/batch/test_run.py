@@ -11,6 +11,7 @@ import pytest
 import fflin
 from fflin.batch.files import FileStore, MemoryStore, read_rows
 from fflin.batch.run import Execution, run_chunks
+from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 from tests.support.patience import finished
 
@@ -49,7 +50,7 @@ def expected():
 
 
 @pytest.mark.filterwarnings("ignore:tired")
-@pytest.mark.parametrize("threads, workers", [(1, 0), (3, 0), (1, 2)])
+@pytest.mark.parametrize("threads, workers", [(1, 0), (3, 0), *exhaustive((1, 2))])
 def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
     threads, workers, expected, tmp_path
 ):

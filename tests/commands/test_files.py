@@ -93,7 +93,7 @@ def test_what_a_robot_file_names_is_kept_too(included, tmp_path, capsys, monkeyp
 WRITES = {
     "linearize": ("cubesat", ".npz .mat .json"),
     "lqr": ("cubesat", ".npz .mat .json"),
-    "simulate": ("cubesat --duration 1", ".npz .mat .json .csv"),
+    "simulate": ("cubesat --duration 0.1", ".npz .mat .json .csv"),
     "sweep": ("canadarm2 --random 2", ".npz .h5"),
     "sensitivity": ("cubesat", ".npz .mat .json"),
     "uncertain": ("cubesat --vary base.mass=0.1", ".npz .mat .json"),

@@ -23,10 +23,15 @@ pendulum = false
 """
 
 
-@pytest.mark.compiled  # as a long flight is where numba is installed
+COMPILED = ("--engine", "compiled")  # a long flight takes a minute in Python
+
+
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
-    code, out, err = run("simulate", TOML, "--html", "a.html", "-o", "a.npz", cwd=tmp_path)
+    pytest.importorskip("numba")
+    files = ("--html", "a.html", "-o", "a.npz")
+    code, out, err = run("simulate", TOML, *files, *COMPILED, cwd=tmp_path)
     assert (code, err) == (0, "")
     assert out.startswith("simulate: settled after ")
     assert (tmp_path / "a.html").stat().st_size < 6e6
@@ -52,15 +57,17 @@ def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
     assert motion.momentum_drift.max() < 1e-12
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 def test_the_inspector_with_flexible_arrays_and_a_tank_settles_within_its_limits(tmp_path):
+    pytest.importorskip("numba")
     text = TOML.with_name("inspector_flexible.toml").read_text(encoding="utf-8")
     (tmp_path / "flexible.toml").write_text(
         text.replace("inspector.urdf", TOML.with_suffix(".urdf").as_posix()) + TANK,
         encoding="utf-8",
     )
     given = ("simulate", "flexible.toml", "--duration", "400", "-o", "a.npz", "--html", "a.html")
-    code, out, err = run(*given, cwd=tmp_path)
+    code, out, err = run(*given, *COMPILED, cwd=tmp_path)
     assert (code, err) == (0, "")
     assert out.startswith("simulate: settled after ")
     motion = fflin.Motion.load(tmp_path / "a.npz")

@@ -12,7 +12,7 @@ from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run
 from tests.support.messages import says
 from tests.support.patience import finished
-from tests.support.robots import BUNDLED
+from tests.support.robots import BUNDLED, mostly
 
 BODY = (
     '<inertial><mass value="{mass}"/><inertia ixx="{xx}" iyy="0.4" izz="0.5" ixy="0" ixz="0" '
@@ -36,7 +36,9 @@ OWN = (
 )
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize(
+    "name", mostly(BUNDLED, "cubesat", "inspector", "planar_detumble", "servicer_7dof")
+)
 def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
     code, out, err = run("init", name, "-o", "own.toml", cwd=tmp_path)
     assert (code, err) == (0, "") and says(out, "own.toml", "fflin simulate own.toml")

@@ -14,7 +14,7 @@ ROBOT = "planar_detumble"
 @pytest.mark.exhaustive
 def test_a_plan_is_followed(tmp_path):
     locked = ("--lock", "joint_2", "--lock", "joint_3")
-    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 6)
     command = ("plan", ROBOT, *locked, *target)
     code, out, _ = run(*command, "--limit", "tau_m=0.5", "-o", "p.npz", cwd=tmp_path)
     assert code == 0 and "wrote p.npz" in out

@@ -328,6 +328,7 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
         assert float(value) > float(limit) > abs(lin.u0[lin.input_names.index(name)])
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "fields"),
@@ -337,6 +338,7 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
     ],
 )
 def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
+    pytest.importorskip("numba")
     robot = fflin.load(name, inputs=fflin.load_inputs(name), **fields)
     lin = fflin.linearize(robot)
     for item in robot.inputs:
@@ -347,15 +349,18 @@ def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
     turn = pin.exp3(np.radians(ANGLE) * np.array([2.0, -1.0, 2.0]) / 3.0)
     q0 = fflin.configuration(robot, dict.fromkeys(motors, 0.3), pin.SE3(turn, np.zeros(3)))
     policy = fflin.StateFeedback(lin, gain.K)
-    motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, limits="urdf", every=10)
+    options = {"limits": "urdf", "every": 10, "engine": "compiled"}
+    motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, **options)
     assert not motion.stopped and not motion.passed and not motion.saturated
     assert motion.attitude_error[-1] < 0.1 * ANGLE
 
 
+@pytest.mark.compiled
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("damping", [0.2, 5.0, 20.0])
 def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
     """Light joints are moved against their dampers, not against their inertia."""
+    pytest.importorskip("numba")
     panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
     bare = fflin.load("servicer_7dof", stiffness=panels)
     robot = bare.replace(damping=dict.fromkeys(bare.joint_names, damping))
@@ -375,9 +380,8 @@ def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
         q0 = fflin.configuration(robot, places, pin.SE3(turn, np.zeros(3)))
         policy = fflin.StateFeedback(lin, gain.K)
         duration, dt = 10.0 / bandwidth, min(0.01, 2.5 / np.abs(gain.poles).max())
-        motion = fflin.simulate(
-            robot, policy, q0=q0, duration=duration, dt=dt, every=5, linear=False
-        )
+        options = {"every": 5, "linear": False, "engine": "compiled"}
+        motion = fflin.simulate(robot, policy, q0=q0, duration=duration, dt=dt, **options)
         assert not motion.stopped
         signals = {
             **dict(zip(motion.input_names, motion.u.T, strict=True)),

@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.motions import displaced, motion
 from tests.support.weights import unit_weights
@@ -18,7 +19,7 @@ def nominal():
     return robot, fflin.linearize(robot)
 
 
-@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize("dt", [0.1, *exhaustive(0.0)])
 def test_a_feedback_of_the_nominal_robot_runs_on_another(nominal, dt):
     robot, lin = nominal
     other = robot.perturbed(**SPREAD, seed=4)

@@ -10,6 +10,7 @@ from fflin.analysis.reduction import regulated_part
 from fflin.campaign.runs import KINDS, kinds_of
 from fflin.control.authority import point_properties
 from fflin.robot.rotors import SPINNING
+from tests.support.marks import exhaustive
 from tests.support.wheels import AXES, matched, spun
 
 SPEEDS = (50.0, -80.0, 120.0, 90.0)
@@ -44,7 +45,9 @@ def models(others=(), axes=AXES[:4], spinning=True, dt=0.0, moving=False, **fiel
 
 
 @pytest.mark.parametrize("others", INPUTS)
-@pytest.mark.parametrize("spinning, dt", [(True, 0.0), (True, 0.1), (False, 0.0), (False, 0.1)])
+@pytest.mark.parametrize(
+    "spinning, dt", [(True, 0.1), (False, 0.0), *exhaustive((True, 0.0), (False, 0.1))]
+)
 def test_designs_are_those_of_reaction_wheels(others, spinning, dt):
     (_, lin), (_, other) = models(INPUTS[others], spinning=spinning, dt=dt)
     x, u = matched(lin, other)

@@ -12,7 +12,7 @@ import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
 from tests.support.marks import exhaustive
 from tests.support.messages import says
-from tests.support.robots import free_body
+from tests.support.robots import free_body, mostly
 from tests.support.wheels import AXES, ORTHOGONAL, PYRAMID, carrier_alone, unit, wheels
 
 LAYOUTS = {"orthogonal": ORTHOGONAL, "pyramid": PYRAMID, "skew": AXES[:3], "six": AXES}
@@ -96,7 +96,7 @@ def test_orthogonal_wheels_have_the_textbooks_closed_form():
     }
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", mostly(LAYOUTS, "pyramid", "skew"))
 def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
     """With the wheels' inertia taken out of it and their momentum carried along; H is kept."""
     axes = LAYOUTS[layout]
@@ -139,8 +139,6 @@ def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
     assert np.abs(motion.momentum).max() < 1e-13
 
 
-@pytest.mark.sample
-@pytest.mark.exhaustive
 @pytest.mark.exhaustive
 def test_wheels_on_links_hold_base_and_joints():
     arm = fflin.load("servicer_7dof")
@@ -307,7 +305,7 @@ def test_four_wheels_turn_against_each_other_on_request():
     idle = fflin.velocity(robot, {f"wheel_{k}": 50.0 * (-1) ** k for k in range(1, 5)})
     for design, left in ((gain, 0.2), (loose, 50.0)):
         policy = fflin.StateFeedback(lin, design.K)
-        motion = fflin.simulate(robot, policy, v0=idle, duration=300.0, dt=0.05, linear=False)
+        motion = fflin.simulate(robot, policy, v0=idle, duration=300.0, dt=0.1, linear=False)
         assert np.abs(motion.v[-1, 6:]).max() <= left + 1e-6
         assert motion.attitude_error.max() < 0.3
     assert np.abs(motion.v[-1] - idle).max() < 1e-6

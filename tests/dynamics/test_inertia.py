@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.rnea import STROKE, inertia_bounds
-from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
+from tests.support.robots import BUNDLED, LINKS, MIMIC, mostly, random_tree
 
 
 def chain(*inertias):
@@ -67,7 +67,13 @@ def test_scaling_m_beforehand_would_gain_nothing():
     assert errors[0] < 4 * errors[1]
 
 
-@pytest.mark.parametrize("name", [*BUNDLED, "ur5", "tiago_no_hand", "double_pendulum"])
+@pytest.mark.parametrize(
+    "name",
+    mostly(
+        [*BUNDLED, "ur5", "tiago_no_hand", "double_pendulum"],
+        *("cubesat", "planar_detumble", "ur5", "double_pendulum"),
+    ),
+)
 def test_bound_on_rounding_holds(name):
     """Of M's diagonal at any configuration, and of the error of the quick way to M^-1."""
     robot = fflin.load(name)

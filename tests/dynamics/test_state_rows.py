@@ -7,6 +7,7 @@ import pytest
 import fflin
 from fflin.dynamics.coordinates import moving_error, state_history, states_of, unwound
 from fflin.dynamics.integrators import integrator
+from tests.support.marks import exhaustive
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
 
@@ -201,7 +202,7 @@ def bent(robot):
     return lin, fflin.lqr(lin, *unit_weights(lin))
 
 
-@pytest.mark.parametrize("sample", [None, 0.02])
+@pytest.mark.parametrize("sample", [None, *exhaustive(0.02)])
 def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample):
     robot = fflin.load("ets_vii", stiffness=3.0)
     lin, gain = bent(robot)

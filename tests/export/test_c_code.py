@@ -2,6 +2,7 @@
 
 import copy
 import errno
+import functools
 import json
 import pickle
 import re
@@ -20,6 +21,7 @@ from fflin.export.c_code import _compiled
 from fflin.export.laws import measured
 from fflin.robot.catalog import find_robot
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
+from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 from tests.support.policies import between_gains, compensated
 
@@ -51,6 +53,7 @@ def mixed():
     return robot, fflin.LinearController((by.A, by.B, by.C, D, lin.dt), lin)
 
 
+@functools.cache
 def law(kind):
     if kind in ("hybrid", "local", "world"):
         robot = fflin.load("servicer_7dof")
@@ -82,11 +85,19 @@ KINDS = (
     *("hybrid", "local", "world", "wheels", "no joints", "orbit"),
     *("grid", "lqg", "mixed", "schedule"),
 )
+# Kinds whose code for float is compiled by default. Together they have each function of the code.
+FLOATS = ("wheels", "lqg", "schedule")
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("real", "kind"),
+    [
+        *(("double", kind) for kind in KINDS),
+        *(("float", kind) for kind in FLOATS),
+        *exhaustive(*(("float", kind) for kind in KINDS if kind not in FLOATS)),
+    ],
+)
 def test_the_code_compiles_and_agrees(kind, real, compiler, tmp_path):
     robot, by = law(kind)
     folder = fflin.write_c(by, tmp_path, robot=robot, real=real)
@@ -108,18 +119,20 @@ def test_limits_are_reached_and_told(kind, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "change"),
     [
-        ("hybrid", ("< 0 ? -1 : 1", "< 0 ? 1 : -1")),
-        ("hybrid", ("r[0] * q[3] -", "r[0] * q[3] +")),
-        ("hybrid", ("const controller_real x = two *", "const controller_real x = -two *")),
         ("local", ("? r : q, -1", "? r : q, 1")),
-        ("world", ("rotate(q, 1", "rotate(q, -1")),
         ("wheels", ("*angle -=", "*angle +=")),
-        ("hybrid", ("u[i] -= weight", "u[i] += weight")),
-        ("grid", ("upper ? share[a]", "!upper ? share[a]")),
-        ("mixed", ("D[i][j] * dy", "-D[i][j] * dy")),
         ("lqg", ("A[i][j] * memory", "-A[i][j] * memory")),
-        ("lqg", ("memory->z[i] = next[i]", "memory->z[i] = -next[i]")),
         ("schedule", ("feed_back((int)row", "feed_back(0")),
+        *exhaustive(
+            ("hybrid", ("< 0 ? -1 : 1", "< 0 ? 1 : -1")),
+            ("hybrid", ("r[0] * q[3] -", "r[0] * q[3] +")),
+            ("hybrid", ("const controller_real x = two *", "const controller_real x = -two *")),
+            ("world", ("rotate(q, 1", "rotate(q, -1")),
+            ("hybrid", ("u[i] -= weight", "u[i] += weight")),
+            ("grid", ("upper ? share[a]", "!upper ? share[a]")),
+            ("mixed", ("D[i][j] * dy", "-D[i][j] * dy")),
+            ("lqg", ("memory->z[i] = next[i]", "memory->z[i] = -next[i]")),
+        ),
     ],
 )
 def test_the_test_program_finds_a_changed_line(kind, change, tmp_path):
@@ -238,8 +251,14 @@ def test_the_code_is_not_flown_with_another_robot(tmp_path):
         fflin.CLaw(tmp_path, compiler="no_such_compiler")
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
-@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("ending", "dt"),
+    [
+        ("npz", 0.0),
+        ("json", 0.1),
+        *exhaustive(("npz", 0.1), ("json", 0.0), ("mat", 0.0), ("mat", 0.1)),
+    ],
+)
 def test_a_gain_from_a_file_keeps_its_pose_and_sample_time(ending, dt, tmp_path):
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}, POSE))
@@ -417,14 +436,21 @@ def test_copies_of_the_code_fly_as_the_code(tmp_path):
         assert (other.bind(robot)(0.0, q, np.zeros(robot.nv)) == u).all()
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("axis", [*np.eye(4)[:3].tolist(), [0.6, 0.8, 0.0, 0.0]])
-def test_half_a_turn_is_decided_as_in_python(axis, side, tmp_path):
-    """Both ways back are equally short: the sign of the quaternion decides, in C as in Python."""
+@pytest.fixture(scope="module")
+def about_neutral(tmp_path_factory):
+    """A robot, its regulator about the neutral pose, and the C code of the regulator."""
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     by = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    code = fflin.CLaw(fflin.write_c(by, tmp_path))
+    code = fflin.CLaw(fflin.write_c(by, tmp_path_factory.mktemp("neutral")))
+    return robot, by, code
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("axis", [*np.eye(4)[:3].tolist(), [0.6, 0.8, 0.0, 0.0]])
+def test_half_a_turn_is_decided_as_in_python(axis, side, about_neutral):
+    """Both ways back are equally short: the sign of the quaternion decides, in C as in Python."""
+    robot, by, code = about_neutral
     q, v = np.append(np.zeros(3), side * np.array(axis)), np.zeros(robot.nv)
     u, other = code.bind(robot)(0.0, q, v), by.bind(robot)(0.0, q, v)
     assert np.abs(u).max() > 0.0

@@ -7,8 +7,10 @@ from tests.golden.record import cases, differences, figures, kept
 from tests.support.robots import mostly
 
 # Not without numba, and not by engine: models are made in Python.
-LONG = [f"policies {kind} ets_vii" for kind in ("followed", "followed_outputs")]
-LONG += ["funnel", "validity"]
+# Each policy has a quick case with another robot.
+LONG = [case for case in cases() if case.startswith("policies") and case.endswith("ets_vii")]
+LONG += ["policies controlled cubesat", "policies controlled_in_samples cubesat"]
+LONG += ["policies shared cubesat", "campaign", "funnel", "validity"]
 QUICK = [case for case in cases() if case not in LONG]
 COMPILED = [case for case in cases() if not case.startswith("models")]
 

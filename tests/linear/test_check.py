@@ -12,13 +12,13 @@ import pytest
 import fflin
 from fflin.linear.aba_route import Route
 from tests.support.random_robots import random_case
-from tests.support.robots import random_point, random_pose
+from tests.support.robots import mostly, random_point, random_pose
 
 GROUPS = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 INPUTS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
 
 
-@pytest.fixture(scope="module", params=["hybrid", "local", "world"])
+@pytest.fixture(scope="module", params=mostly(["hybrid", "local", "world"], "hybrid"))
 def moving(request):
     robot = fflin.load("servicer_7dof")
     point = random_point(robot, np.random.default_rng(1), degrees=50.0)

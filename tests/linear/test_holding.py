@@ -57,7 +57,7 @@ def test_wheels_gain_in_flight_what_the_report_says():
     gain = fflin.lqr(lin)
     assert says(str(gain), "held at the operating point: u0")
     motion = fflin.simulate(
-        robot, fflin.StateFeedback(lin, gain.K), q0=q, duration=ORBIT.period, dt=ORBIT.period / 2e3
+        robot, fflin.StateFeedback(lin, gain.K), q0=q, duration=ORBIT.period, dt=ORBIT.period / 1e3
     )
     speeds = motion.v[:, 6:]
     turned = np.degrees(2.0 * np.arcsin(np.linalg.norm(motion.x[:, :3] - motion.x[0, :3], axis=1)))

@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.orbits import in_orbit
 from tests.support.robots import free_body
 
@@ -25,8 +26,14 @@ def matched(found, expected):
     return worst
 
 
-@pytest.mark.parametrize("n", [0.3, LEO, GEO])
-@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+@pytest.mark.parametrize(
+    ("frame", "n"),
+    [
+        ("lvlh", 0.3),
+        ("hill", LEO),
+        *exhaustive(("lvlh", LEO), ("lvlh", GEO), ("hill", 0.3), ("hill", GEO)),
+    ],
+)
 def test_libration_has_the_poles_of_textbooks(n, frame):
     for moments in BODIES:
         robot = in_orbit(free_body(moments), n)

@@ -11,6 +11,7 @@ import fflin
 from fflin.simulation.report import motion_report
 from fflin.simulation.run import Conserved
 from tests.simulation.test_simulate import displaced, free_body, regulated, tumbling
+from tests.support.marks import exhaustive
 from tests.support.robots import random_tree
 
 
@@ -117,8 +118,17 @@ def test_the_line_of_the_centre_of_mass_is_of_the_order_of_the_method(method, or
     assert -np.diff(np.log2(errors))[-1] == pytest.approx(order, abs=0.1)
 
 
-@pytest.mark.parametrize("options", [{}, {"sample": 0.1, "delay": 0.05}])
-@pytest.mark.parametrize("frame", ["hybrid", "local", "world"])
+SAMPLED = {"sample": 0.1, "delay": 0.05}
+
+
+@pytest.mark.parametrize(
+    ("frame", "options"),
+    [
+        ("hybrid", {}),
+        ("local", SAMPLED),
+        *exhaustive(("hybrid", SAMPLED), ("local", {}), ("world", {}), ("world", SAMPLED)),
+    ],
+)
 def test_the_line_is_kept_where_everything_acts_and_the_order_too(frame, options):
     robot, acting = acted_on()
 

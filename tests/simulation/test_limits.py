@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.robots import free_body
 
@@ -53,9 +54,21 @@ def test_limits_of_the_robot_cut_and_given_ones_go_first():
     assert set(acted.values()) == {5.0}
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("sample", [None, 0.5])
-@pytest.mark.parametrize("method", ["cf4", "semi_implicit_euler"])
+@pytest.mark.parametrize(
+    ("method", "sample", "sign"),
+    [
+        ("cf4", None, 1.0),
+        ("semi_implicit_euler", 0.5, -1.0),
+        *exhaustive(
+            ("cf4", None, -1.0),
+            ("cf4", 0.5, 1.0),
+            ("cf4", 0.5, -1.0),
+            ("semi_implicit_euler", None, 1.0),
+            ("semi_implicit_euler", None, -1.0),
+            ("semi_implicit_euler", 0.5, 1.0),
+        ),
+    ],
+)
 def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
     robot = spinner()
     motion = fflin.simulate(

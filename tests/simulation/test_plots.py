@@ -221,7 +221,8 @@ def levels(axes):
 
 
 def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
-    found = panels(limited.plot())
+    figure = limited.plot()
+    found = panels(figure)
     assert levels(found["base torque"]) == ([8.0], 1)
     assert levels(found["thrusters"]) == ([22.0], 1)
     assert levels(found["joint torques"]) == ([300.0], 1)
@@ -229,7 +230,6 @@ def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
     assert levels(found["wheel momentum"]) == ([15.0], 1)
     assert levels(found["joint rates qdot_m"])[0] in ([0.05], [-0.05, 0.05])
     assert levels(found["joints q_m"]) == ([], 0)
-    figure = limited.plot()
     (named,) = [x for x in figure.legends if x.get_title().get_text() == "joints"]
     assert [text.get_text() for text in named.get_texts()].count("limit") == 1
 

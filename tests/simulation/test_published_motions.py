@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 import fflin
 from fflin.dynamics.aba import Aba
 from fflin.linear.nonlinear import Nonlinear
+from tests.support.marks import exhaustive
 
 
 def flown(robot, q, v, u, duration):
@@ -88,7 +89,7 @@ def test_spin_up_of_one_wheel():
     assert x[g.qdot_m] == pytest.approx([expected], rel=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["joint", "stored"])
+@pytest.mark.parametrize("kind", ["joint", *exhaustive("stored")])
 def test_total_momentum_is_conserved_along_a_motion(kind):
     """An arm swings on a base with wheels at speed; H in the world stays, the wheels' in it."""
     bare = fflin.load("dual_arm")

@@ -61,6 +61,7 @@ def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
     assert found.margin.value == pytest.approx(1.0 / max(peaks), rel=1e-3)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(monkeypatch, servicer):
     slycot = pytest.importorskip("slycot")
@@ -112,7 +113,7 @@ def springy(request):
     of, gain = fflin.uncertain(robot, SETS[request.param]), fflin.lqr(fflin.linearize(robot))
     scale = np.sqrt(gain.R.diagonal())
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    rows, figures = np.vstack((corners, of.draws(40, seed=0)[0])), []
+    rows, figures = np.vstack((corners, of.draws(20, seed=0)[0])), []
     for delta in rows:
         lin = fflin.linearize(of.at(of.values(delta)))
         F, poles = lin.A - lin.B @ gain.K, np.linalg.eigvals(lin.A - lin.B @ gain.K)
@@ -126,7 +127,7 @@ def springy(request):
 def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, figures = springy
-    least = of.worst(gain, samples=40)
+    least = of.worst(gain, samples=20)
     found = np.array((least.damping.value, least.margin.value, -least.gain.value))
     assert least.tried == len(figures) + 1
     # The gains are to five digits; the damping is by eigenvalues alone.
@@ -142,7 +143,7 @@ def test_more_samples_never_find_less(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, _ = springy
     assert (of.draws(40, seed=3)[0][:7] == of.draws(7, seed=3)[0]).all()
-    found = [of.worst(gain, samples=n, seed=3) for n in (1, 5, 40)]
+    found = [of.worst(gain, samples=n, seed=3) for n in (1, 5, 20)]
     for fewer, more in itertools.pairwise(found):
         assert more.damping.value <= fewer.damping.value
         assert more.margin.value <= fewer.margin.value

@@ -66,7 +66,8 @@ def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, m
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o755)
     monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: str(program))
-    monkeypatch.setattr("fflin.view.capture._PATIENCE", 1.0)
+    monkeypatch.setattr("fflin.view.capture._PATIENCE", 0.1)
+    monkeypatch.setattr("fflin.view.capture._PER_PICTURE", 0.0)
     with pytest.raises(fflin.FileError, match="respond"):
         fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
     assert not (tmp_path / "m.png").exists()

@@ -13,6 +13,7 @@ import fflin
 from fflin.robot.robot import ROOT
 from fflin.view.visualize import tool_frame
 from tests.support.browser import Watched
+from tests.support.marks import exhaustive
 from tests.support.motions import HOME, led, settling
 
 # Positions travel as 32-bit floats, of metres.
@@ -60,8 +61,9 @@ def largest_difference(watched, robot, q, node="robot"):
 
 @pytest.mark.sample
 @pytest.mark.browser
-def test_bodies_stand_where_forward_kinematics_puts_them(settled, watched):
-    robot, motion, _ = settled
+def test_bodies_stand_where_forward_kinematics_puts_them(settled, watch):
+    robot, motion, path = settled
+    watched = watch(path.as_uri() + "#pause")  # not painted: drawing takes most of the time
     for t in (0.0, 1.3, 5.0, 11.9, 20.0):
         watched.do(f"viewer.animator.pause(); viewer.animator.seek({t}); viewer.render()")
         q = motion.q[np.argmin(np.abs(motion.t - t))]
@@ -398,7 +400,7 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
     assert np.median(watched.picture()[:40]) > 150
 
 
-@pytest.mark.parametrize(("name", "limit"), [("servicer_7dof", 3e6), ("talos", 8e6)])
+@pytest.mark.parametrize(("name", "limit"), [("servicer_7dof", 3e6), *exhaustive(("talos", 8e6))])
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_the_files_are_small(name, limit, tmp_path):
     robot = fflin.load(name)
