@@ -12,7 +12,8 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, ArrayLike, Mask, instance, number, whole
+from fflin.base.validation import Array, ArrayLike, Mask, number, whole
+from fflin.control.optimal.initial_guess import JointMotion, initial_guess
 from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
@@ -50,7 +51,7 @@ def plan(
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
-    guess: Trajectory | None = None,
+    guess: Trajectory | JointMotion | None = None,
     progress: bool | None = None,
 ) -> Trajectory:
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
@@ -183,7 +184,7 @@ def plan(
         cost = held[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
-        first = shooting.guess(start, end) if guess is None else _guessed(shooting, guess, start)
+        first = initial_guess(shooting, guess, start, end, asked, bounds)
         made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u
@@ -214,22 +215,6 @@ class _Made(NamedTuple):
     def reached(self) -> bool:
         """Whether the motion ends at the goal and is within the limits at the knots."""
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
-
-
-def _guessed(shooting: Shooting, guess: object, start: Point) -> tuple[Array, Array, Array]:
-    """Return knots q, v and inputs u of a given motion, at the times of the plan."""
-    motion = instance("guess", guess, Trajectory, "a fflin.Trajectory")
-    robot = shooting.state.robot
-    if (motion.robot.nq, motion.robot.nv) != (robot.nq, robot.nv) or (
-        input_keys(motion.actuation) != input_keys(Actuation(shooting.state))
-    ):
-        raise InputError("guess is a motion of a robot with other joints or inputs")
-    fraction = shooting.t / shooting.t[-1]
-    pace = (motion.t[-1] - motion.t[0]) / shooting.t[-1]
-    q, v, u = motion.points(motion.t[0] + fraction * (motion.t[-1] - motion.t[0]))
-    q, v = q.copy(), pace * v
-    q[0], v[0] = start
-    return q, v, u.copy()
 
 
 def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:

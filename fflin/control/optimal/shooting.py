@@ -197,6 +197,10 @@ class Shooting:
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end
+        return q, v, self.inputs(q, v)
+
+    def inputs(self, q: Array, v: Array) -> Array:
+        """Return inputs u (N + 1, nu) that approximately cause the motion through the knots q, v."""
         u = np.zeros((len(q), len(self._linearizer().u0)))
         wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
         by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
@@ -205,4 +209,5 @@ class Shooting:
         # problem would be about standing wheels instead of the motion of the base and the joints.
         kept = np.delete(np.arange(self.state.nx // 2), self.wheels)
         by_u, rates = by_u[:, kept], rates[:, kept]
-        return q, v, (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        inputs: Array = (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        return inputs
