@@ -184,7 +184,7 @@ def plan(
         cost = held[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
-        first = initial_guess(shooting, guess, start, end, asked, bounds)
+        first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
         made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u

@@ -63,6 +63,15 @@ class FloatingBase:
         coupling = -inverse @ matrices[:, 3:, 6:]
         return Centroidal(inverse, coupling, center, matrices[:, :3, 6:] / self._mass)
 
+    def inertia(self, joints: Array) -> Array:
+        """Return the generalised inertia (n, n) of the joints if the base floats, at q_m (n,)."""
+        states = np.zeros((1, self._state.nx))
+        states[0, 6 : 6 + len(joints)] = joints
+        _, q, _ = self._state.points(states)
+        M = self._spread.T @ pin.crba(self._model, self._data, q[0]) @ self._spread
+        reduced: Array = M[6:, 6:] - M[6:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
+        return reduced
+
     def rotations(self, t: Array, joints: Array) -> Array:
         """Return the rotations of the base (N, 3, 3) along a joint path (N, n) at times t (N,).
 

@@ -41,11 +41,12 @@ def initial_guess(
     end: Point,
     asked: Mask,
     bounds: Array,
+    weights: Array,
 ) -> Knots:
     """Return the knots q, v and the inputs u at which the search begins.
 
     `asked` (nx,) is True for the states whose end value is prescribed, and `bounds` (2, nx)
-    contains the limits of the states.
+    contains the limits of the states. `weights` (nu,) are the weights of the squared inputs.
     """
     if isinstance(guess, Trajectory):
         return _of_trajectory(shooting, guess, start)
@@ -57,7 +58,7 @@ def initial_guess(
             )
         return _of_joints(shooting, guess, start, end)
     if _needs_loops(shooting, asked):
-        return _with_loops(shooting, start, end, asked, bounds)
+        return _with_loops(shooting, start, end, asked, bounds, weights)
     return shooting.guess(start, end)
 
 
@@ -98,7 +99,9 @@ def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point)
             for name, position in by_name.items():
                 row[robot.joint_names.index(name)] = position
         else:
-            row[:] = vector(what, value, robot.n, "joint positions in the order of robot.joint_names")
+            row[:] = vector(
+                what, value, robot.n, "joint positions in the order of robot.joint_names"
+            )
     base = FloatingBase(shooting.state, start) if conserves_momentum(robot) else None
     return _along(shooting, base, times, joints, start, end)
 
@@ -115,7 +118,7 @@ def _needs_loops(shooting: Shooting, asked: Mask) -> bool:
 
 
 def _with_loops(
-    shooting: Shooting, start: Point, end: Point, asked: Mask, bounds: Array
+    shooting: Shooting, start: Point, end: Point, asked: Mask, bounds: Array, weights: Array
 ) -> Knots:
     """Return knots and inputs of a motion whose joint loops rotate the base to the goal."""
     state = shooting.state
@@ -126,10 +129,11 @@ def _with_loops(
         base,
         times,
         _straight(shooting, start, end, times),
-        np.array(sorted(moved)),
+        np.array(moved),
         state.rotation(end[0]),
         asked[groups.q_b],
         np.stack((bounds[:, groups.q_m], bounds[:, groups.qdot_m]), axis=1),
+        weights,
     )
     joints = loops.path
     if np.linalg.norm(loops.error(joints)) > _REACHED:

@@ -42,9 +42,9 @@ _POSTURES, _IMPROVED = 12, 3
 # Largest amplitude of a joint [rad, m], if its limits allow it.
 _LARGEST = 1.0
 
-# Weight of the amplitude in the least squares, relative to the error of the attitude [rad]. Small
-# loops need little effort, but a large weight would leave an error.
-_OF_AMPLITUDE = 0.01
+# Weight of the root mean square of the torques in the least squares, relative to the error of the
+# attitude [rad]. The torques of the best ellipse count as 1. A large weight would leave an error.
+_OF_TORQUES = 0.03
 
 # An error of the attitude below this [rad] is left to the search for the plan.
 _NEAR = 0.01
@@ -99,6 +99,7 @@ class Loops:
     target: Array  # rotation (3, 3) of the base at the end
     asked: Mask  # components (3,) of the rotation vector of the attitude error that must vanish
     bounds: Array  # limits of the joint positions and rates (2, 2, n): lower and upper, then kind
+    weights: Array  # weights of the squared torques of the joints `moved` (m,)
 
     @cached_property
     def scale(self) -> Array:
@@ -139,12 +140,22 @@ class Loops:
         per_time = self.scale * np.array([[1.0], [2.0 * np.pi / self.t[-1]]])
         return excess / per_time
 
-    def residuals(self, basis: Array, coefficients: Array) -> Array:
-        """Return the residuals of the least squares: error, amplitudes and violations of limits."""
-        joints = self.joints(basis, coefficients)
-        amplitudes = _OF_AMPLITUDE * coefficients.ravel()
-        violations = self.beyond(joints).max(axis=0).ravel()
-        return np.concatenate((self.error(joints), amplitudes, violations))
+    def torques(self, basis: Array, coefficients: Array) -> Array:
+        """Return weighted torques (4, m) whose sum of squares is the mean effort of the loops.
+
+        The inertia is that of the middle of the path, and terms quadratic in the rates are ignored.
+        """
+        inertia = self.base.inertia(self.middle)[np.ix_(self.moved, self.moved)]
+        rates = np.gradient(basis, self.t, axis=0)
+        factor = np.linalg.qr(np.gradient(rates, self.t, axis=0), "r") / np.sqrt(len(self.t))
+        torques: Array = factor @ (coefficients * self.scale) @ inertia * np.sqrt(self.weights)
+        return torques
+
+    @property
+    def middle(self) -> Array:
+        """Joint positions (n,) in the middle of the path."""
+        middle: Array = self.path[len(self.path) // 2].copy()
+        return middle
 
     def ellipses(self, circles: int, postures: Array) -> Iterator[Array]:
         """Yield coefficients (4, m) of ellipses whose centres are near the given postures.
@@ -152,11 +163,10 @@ class Loops:
         `postures` (P, m) are displacements from the middle of the path, in units of `scale`. The
         areas of the ellipses follow from the curvature at the postures.
         """
-        middle = self.path[len(self.path) // 2]
         turn = self.error(self.path)
         angle = float(np.linalg.norm(turn))
         for posture in postures:
-            joints = middle.copy()
+            joints = self.middle
             joints[self.moved] += posture * self.scale
             F = curvature(self.base, joints)[np.ix_(self.moved, self.moved)]
             a, b, most = best_plane(F, turn, self.scale)
@@ -180,16 +190,18 @@ class Loops:
         postures = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, len(self.moved)))
         postures[0] = 0.0
         best, least, circles = self.path, np.inf, 1
-        while circles <= most_circles:
+        while circles <= most_circles and least > _NEAR:
             every = MOST_CIRCLES // circles
             coarse = replace(self, t=self.t[::every], path=self.path[::every])
+            least_effort = np.inf
             for coefficients in coarse.improved(circles, postures):
-                joints = self.joints(self.basis(circles), coefficients)
+                basis = self.basis(circles)
+                joints = self.joints(basis, coefficients)
                 error = float(np.linalg.norm(self.error(joints)) + self.beyond(joints).max())
-                if error < least:
-                    best, least = joints, error
-                if least < _NEAR:
-                    return best, least
+                effort = float(np.square(self.torques(basis, coefficients)).sum())
+                # Prefer a small error; if several errors are small, prefer a small effort.
+                if (max(error, _NEAR), effort) < (max(least, _NEAR), least_effort):
+                    best, least, least_effort = joints, error, effort
             circles *= 2
         return best, least
 
@@ -197,14 +209,23 @@ class Loops:
         """Yield the coefficients (4, m) of ellipses after least squares, the best ellipses first."""
         basis = self.basis(circles)
 
-        def residuals(coefficients: Array) -> Array:
-            return self.residuals(basis, coefficients.reshape(4, -1))
+        def error(coefficients: Array) -> Array:
+            """Return the error of the attitude and the violations of limits."""
+            joints = self.joints(basis, coefficients)
+            return np.concatenate((self.error(joints), self.beyond(joints).max(axis=0).ravel()))
 
-        def cost(coefficients: Array) -> float:
-            return float(np.square(residuals(coefficients)).sum())
+        ellipses = sorted(
+            self.ellipses(circles, postures), key=lambda each: float(np.linalg.norm(error(each)))
+        )[:_IMPROVED]
+        unit = _OF_TORQUES / float(np.linalg.norm(self.torques(basis, ellipses[0])))
 
-        for first in sorted(self.ellipses(circles, postures), key=cost)[:_IMPROVED]:
-            improved = least_squares(
-                residuals, first.ravel(), max_nfev=_EVALUATIONS, ftol=1e-4, xtol=1e-4
+        def residuals(flat: Array) -> Array:
+            coefficients = flat.reshape(4, -1)
+            torques = unit * self.torques(basis, coefficients)
+            return np.concatenate((error(coefficients), torques.ravel()))
+
+        for ellipse in ellipses:
+            found = least_squares(
+                residuals, ellipse.ravel(), max_nfev=_EVALUATIONS, ftol=1e-4, xtol=1e-4
             )
-            yield improved.x.reshape(4, -1)
+            yield found.x.reshape(4, -1)
