@@ -102,11 +102,19 @@ def plan(
     free : sequence of str
         States whose end value is free, by name, group or pattern:
         ``["r_b", "qdot_m.wheel_*"]``.
-    guess : Trajectory, optional
-        Motion at which the search begins, with its time scaled to the duration. By default, the
-        search begins at a cubic curve from the start to the goal. If joint torques alone act, the
-        system is nonholonomic: only loops of the joints rotate the base. Then give a guess in which
-        the joints move in loops.
+    guess : Trajectory or callable, optional
+        Motion at which the search begins: a trajectory, whose time is scaled to the duration, or a
+        function ``guess(t)`` of the time t [s] from 0 to the duration. The function returns the
+        joint positions (n,) [rad or m] in the order of ``robot.joint_names``, or a mapping {joint
+        or pattern: position}; joints that it does not name move on a cubic curve from the start to
+        the goal. Continuous joints may have angles beyond pi. If the inputs are torques between
+        bodies of the robot, the base moves as the conserved momentum requires. Otherwise the base
+        moves on the cubic curve.
+
+        By default, the search begins at a cubic curve from the start to the goal. If all inputs are
+        joint torques, the system is nonholonomic, and the base reaches most attitudes only if the
+        joints move in loops. Then the search begins at loops of the joints that rotate the base to
+        the attitude of the goal. The loops stay within the limits of the joints if possible.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
         violation on stderr. By default, they are shown for long runs if stderr is a terminal.
@@ -279,7 +287,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
         "give a longer duration, wider limits or more knots, or leave the final value of some "
         "states free with `free` (--free-end)"
     )
-    internal = all(isinstance(each, JointTorque | ReactionWheel) for each in robot.inputs)
+    internal = all(isinstance(item, JointTorque | ReactionWheel) for item in robot.inputs)
     if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
         advice = (
             "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
@@ -291,8 +299,8 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     ):
         advice = (
             "joint torques alone rotate the base only if the joints move in loops (the system is "
-            "nonholonomic); give a `guess` in which the joints move in loops, or leave q_b free "
-            "with `free` (--free-end)"
+            "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
+            "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
