@@ -31,6 +31,24 @@ def test_a_plan_is_followed(tmp_path):
     assert "--duration" in refused("plan", ROBOT)
 
 
+@pytest.mark.exhaustive
+def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
+    """A plan that begins at a minimum ends there at once, and the file is not overwritten."""
+    locked = ("--lock", "joint_2", "--lock", "joint_3")
+    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    command = ("plan", ROBOT, *locked, *target, "--limit", "tau_m=0.5")
+    assert run(*command, "-o", "first.csv", cwd=tmp_path)[0] == 0
+    code, _, err = run(*command, "--guess", "first.csv", "-o", "again.npz", cwd=tmp_path)
+    assert code == 0, err
+    robot = fflin.load(ROBOT, lock=["joint_2", "joint_3"])
+    first = fflin.Trajectory.load(tmp_path / "first.csv", robot)
+    again = fflin.Trajectory.load(tmp_path / "again.npz", robot)
+    assert np.abs(again.u - first.u).max() < 1e-3 * np.abs(first.u).max()
+    code, _, err = run(*command, "--guess", "first.csv", "-o", "first.csv", cwd=tmp_path)
+    assert code != 0 and "first.csv" in err
+    assert "missing.csv" in refused(*command, "--guess", "missing.csv")
+
+
 WHEELS = """
 [[input]]
 type = "reaction_wheel"

@@ -1,5 +1,7 @@
 """Loops of joints that rotate a floating base: area rule, closed form, and the initial guess."""
 
+from itertools import pairwise
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,6 +15,7 @@ from fflin.control.optimal.joint_loops import (
     best_plane,
     curvature,
 )
+from tests.support.marks import exhaustive
 from tests.support.mechanisms import motors
 from tests.support.robots import random_tree
 
@@ -54,7 +57,7 @@ def test_a_loop_of_a_turn_and_a_slide_has_the_closed_form(polar):
     """Out at the angle 0, turn by alpha, in, turn back: -alpha (f(r_2) - f(r_1)), of any size."""
     alpha, inner, outer = 2.0, 0.4, 1.1
     corners = np.array([(0, inner), (0, outer), (alpha, outer), (alpha, inner), (0, inner)])
-    joints = np.vstack([np.linspace(a, b, 9) for a, b in zip(corners, corners[1:], strict=False)])
+    joints = np.vstack([np.linspace(a, b, 9) for a, b in pairwise(corners)])
     turned = rotation_vector(base_at_rest(polar), joints)
     # The midpoint rule is exact here, because each leg changes one coordinate only.
     exact = -alpha * (fraction(outer) - fraction(inner))
@@ -123,7 +126,8 @@ def test_the_floating_base_moves_as_in_a_simulation():
         base = FloatingBase(state, (q0, v0))
         R = base.rotations(t, joints[::every])
         found = base.motion(t, joints[::every], rates[::every], R)
-        gaps = [pin.difference(robot.model, *pair) for pair in zip(q[::every], found[0])]
+        pairs = zip(q[::every], found[0], strict=True)
+        gaps = [pin.difference(robot.model, *pair) for pair in pairs]
         errors.append(max(np.abs(gaps).max(), np.abs(v[::every] - found[1]).max()))
     assert errors[0] < 1e-2 and errors[1] < 0.3 * errors[0]
 
@@ -162,3 +166,21 @@ def test_more_circles_reach_what_one_circle_within_the_limits_cannot(polar):
     assert most < np.deg2rad(25.0)
     loops = loops_of(polar, start, target, limits)
     assert loops.best(1)[1] > 0.02 and loops.best(4)[1] < 0.01
+
+
+@exhaustive
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_loops_reach_attitudes_that_other_loops_reach(n):
+    """Targets are the ends of random ellipses of all joints of random robots."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        robot = random_tree(rng, n, prismatic=False)
+        phase = np.linspace(0.0, 2.0 * np.pi, 385)
+        basis = np.array([1.0 - np.cos(phase), np.sin(phase)]).T
+        known = basis @ rng.normal(scale=0.6, size=(2, n))
+        target = pin.exp3(rotation_vector(base_at_rest(robot), known))
+        loops = loops_of(robot, robot.neutral(), target)
+        joints, error = loops.best(4)
+        # Least squares leave less than 0.03 of the rotation, see `_NEAR`.
+        assert error <= 0.03 * np.linalg.norm(pin.log3(target))
+        assert np.linalg.norm(loops.error(joints)) == pytest.approx(error, rel=1e-6)

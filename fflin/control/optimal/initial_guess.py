@@ -124,7 +124,8 @@ def _with_loops(
     state = shooting.state
     robot, groups, base = state.robot, state.groups, FloatingBase(state, start)
     times = np.linspace(0.0, shooting.t[-1], STEPS * MOST_CIRCLES + 1)
-    moved = [robot.joint_names.index(item.joint) for item in robot.inputs]
+    motors = [item.joint for item in robot.inputs if isinstance(item, JointTorque)]
+    moved = [robot.joint_names.index(name) for name in motors]
     loops = Loops(
         base,
         times,

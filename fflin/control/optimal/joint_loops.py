@@ -43,11 +43,12 @@ _POSTURES, _IMPROVED = 12, 3
 _LARGEST = 1.0
 
 # Weight of the root mean square of the torques in the least squares, relative to the error of the
-# attitude [rad]. The torques of the best ellipse count as 1. A large weight would leave an error.
-_OF_TORQUES = 0.03
+# attitude. The torques of the best ellipse count as 1, and so does the rotation from the end of the
+# path to the target. A large weight would leave an error.
+_OF_TORQUES = 0.05
 
-# An error of the attitude below this [rad] is left to the search for the plan.
-_NEAR = 0.01
+# An error of the attitude below this fraction of the rotation is left to the search for the plan.
+_NEAR = 0.03
 
 # Largest number of evaluations of the Jacobian in a least-squares problem.
 _EVALUATIONS = 40
@@ -105,7 +106,8 @@ class Loops:
     def scale(self) -> Array:
         """Amplitudes (m,) of the joints that use half of the range, but at most `_LARGEST`."""
         low, high = self.bounds[:, 0, self.moved]
-        return np.clip(0.5 * (high - low), 1e-3, _LARGEST)
+        scale: Array = np.clip(0.5 * (high - low), 1e-3, _LARGEST)
+        return scale
 
     def basis(self, circles: int) -> Array:
         """Return the four Fourier functions (K, 4) with one and two circles per period.
@@ -129,7 +131,8 @@ class Loops:
         It is in base axes. Components that are not asked for are zero.
         """
         R = self.base.rotations(self.t, joints)[-1]
-        return np.asarray(pin.log3(R.T @ self.target)) * self.asked
+        error: Array = np.asarray(pin.log3(R.T @ self.target)) * self.asked
+        return error
 
     def beyond(self, joints: Array) -> Array:
         """Return the violations (K - 1, 2, m) of the limits, relative to `scale`."""
@@ -185,12 +188,13 @@ class Loops:
 
         The error is the sum of the attitude error [rad] at the end, and of the largest violation of
         a limit relative to `scale`. Loops with few circles are preferred, because they need less
-        effort.
+        effort. The path without loops must miss the target.
         """
+        near = _NEAR * float(np.linalg.norm(self.error(self.path)))
         postures = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, len(self.moved)))
         postures[0] = 0.0
         best, least, circles = self.path, np.inf, 1
-        while circles <= most_circles and least > _NEAR:
+        while circles <= most_circles and least > near:
             every = MOST_CIRCLES // circles
             coarse = replace(self, t=self.t[::every], path=self.path[::every])
             least_effort = np.inf
@@ -200,13 +204,13 @@ class Loops:
                 error = float(np.linalg.norm(self.error(joints)) + self.beyond(joints).max())
                 effort = float(np.square(self.torques(basis, coefficients)).sum())
                 # Prefer a small error; if several errors are small, prefer a small effort.
-                if (max(error, _NEAR), effort) < (max(least, _NEAR), least_effort):
+                if (max(error, near), effort) < (max(least, near), least_effort):
                     best, least, least_effort = joints, error, effort
             circles *= 2
         return best, least
 
     def improved(self, circles: int, postures: Array) -> Iterator[Array]:
-        """Yield the coefficients (4, m) of ellipses after least squares, the best ellipses first."""
+        """Yield the coefficients (4, m) of the best ellipses, improved by least squares."""
         basis = self.basis(circles)
 
         def error(coefficients: Array) -> Array:
@@ -217,7 +221,9 @@ class Loops:
         ellipses = sorted(
             self.ellipses(circles, postures), key=lambda each: float(np.linalg.norm(error(each)))
         )[:_IMPROVED]
-        unit = _OF_TORQUES / float(np.linalg.norm(self.torques(basis, ellipses[0])))
+        angle = float(np.linalg.norm(self.error(self.path)))
+        size = float(np.linalg.norm(self.torques(basis, ellipses[0])))
+        unit = _OF_TORQUES * angle / size
 
         def residuals(flat: Array) -> Array:
             coefficients = flat.reshape(4, -1)

@@ -200,7 +200,7 @@ class Shooting:
         return q, v, self.inputs(q, v)
 
     def inputs(self, q: Array, v: Array) -> Array:
-        """Return inputs u (N + 1, nu) that approximately cause the motion through the knots q, v."""
+        """Return inputs u (N + 1, nu) that approximately cause a motion through the knots q, v."""
         u = np.zeros((len(q), len(self._linearizer().u0)))
         wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
         by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
