@@ -15,7 +15,6 @@ from fflin.control.optimal.joint_loops import (
     best_plane,
     curvature,
 )
-from tests.support.marks import exhaustive
 from tests.support.mechanisms import motors
 from tests.support.robots import random_tree
 
@@ -168,7 +167,7 @@ def test_more_circles_reach_what_one_circle_within_the_limits_cannot(polar):
     assert loops.best(1)[1] > 0.02 and loops.best(4)[1] < 0.01
 
 
-@exhaustive
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_loops_reach_attitudes_that_other_loops_reach(n):
     """Targets are the ends of random ellipses of all joints of random robots."""

@@ -139,9 +139,10 @@ class Loops:
         rates = np.diff(joints, axis=0) / np.diff(self.t)[:, None]
         values = np.stack((joints[1:], rates), axis=1)[..., self.moved]
         low, high = self.bounds[..., self.moved]
-        excess: Array = np.maximum(np.maximum(values - high, low - values), 0.0)
-        per_time = self.scale * np.array([[1.0], [2.0 * np.pi / self.t[-1]]])
-        return excess / per_time
+        excess = np.maximum(np.maximum(values - high, low - values), 0.0)
+        # The rate of a loop is its amplitude times 2 pi / duration.
+        relative: Array = excess / (self.scale * [[1.0], [2.0 * np.pi / self.t[-1]]])
+        return relative
 
     def torques(self, basis: Array, coefficients: Array) -> Array:
         """Return weighted torques (4, m) whose sum of squares is the mean effort of the loops.
