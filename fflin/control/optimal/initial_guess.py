@@ -193,4 +193,7 @@ def _along(
         R = base.rotations(times, joints)[::every]
         q, v = base.motion(shooting.t, positions, rates, R)
     q[0], v[0] = start
-    return q, v, shooting.inputs(q, v)
+    u = shooting.inputs(q, v)
+    if shooting.held:  # an input is constant until the next knot
+        u[:-1] = 0.5 * (u[:-1] + u[1:])
+    return q, v, u
