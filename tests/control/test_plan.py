@@ -600,6 +600,11 @@ def pitched(loop):
     return q[-1]
 
 
+def largest_change_of_momentum(robot, motion):
+    """Return how much the momentum may change, if each interval has an error of 1e-6 m/s."""
+    return 1e-6 * (len(motion.t) - 1) * pin.computeTotalMass(robot.model)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("free", [FREE_OF_JOINTS, []])
 def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched, free):
@@ -608,7 +613,7 @@ def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched,
         motion = fflin.plan(robot, (pitched, None), 10.0, knots=11, free=free, limits=None)
     assert missed(robot, motion, pitched) < 1e-6 and motion.residual.max() < 1e-6
     momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
-    assert np.abs(momenta).max() < 1e-6
+    assert np.abs(momenta).max() < largest_change_of_momentum(robot, motion)
 
 
 @pytest.mark.exhaustive
@@ -620,8 +625,10 @@ def test_loops_add_to_the_rotation_by_the_conserved_momentum(loop):
     with any_wording():
         motion = fflin.plan(robot, (goal, None), 10.0, **options)
     assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:]).max() < 1e-6
-    before, *_, after = (momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True))
-    assert np.abs(before).max() > 0.1 and after == pytest.approx(before, abs=1e-5)
+    assert motion.residual.max() < 1e-6
+    momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    change = np.abs(np.subtract(momenta, momenta[0])).max()
+    assert np.abs(momenta[0]).max() > 1.0 and change < largest_change_of_momentum(robot, motion)
 
 
 @pytest.mark.exhaustive

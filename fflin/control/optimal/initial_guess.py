@@ -179,21 +179,22 @@ def _along(
     curve of the default guess.
     """
     state, every = shooting.state, (len(times) - 1) // len(shooting.h)
-    positions = joints[::every]
-    rates = CubicSpline(times, joints)(times, 1)[::every]
+    rates = CubicSpline(times, joints)(times, 1)
     if base is None:
         q, v, _ = shooting.guess(start, end)
-        for joint, values in zip(state.robot.joints, positions.T, strict=True):
+        for joint, values in zip(state.robot.joints, joints[::every].T, strict=True):
             joint.place(q.T, values)
         state.robot.follow(q.T)
         nu = state.velocities(v)
-        nu[:, 6:] = rates
-        v = state.spread(nu)
-    else:
-        R = base.rotations(times, joints)[::every]
-        q, v = base.motion(shooting.t, positions, rates, R)
+        nu[:, 6:] = rates[::every]
+        q[0], v = start[0], state.spread(nu)
+        v[0] = start[1]
+        return q, v, shooting.inputs(shooting.t, q, v)
+    q, v = base.motion(times, joints, rates, base.rotations(times, joints))
     q[0], v[0] = start
-    u = shooting.inputs(q, v)
+    inputs = shooting.inputs(times, q, v)
+    u = inputs[::every]
     if shooting.held:  # an input is constant until the next knot
-        u[:-1] = 0.5 * (u[:-1] + u[1:])
-    return q, v, u
+        parts = 0.5 * (inputs[1:] + inputs[:-1])
+        u[:-1] = parts.reshape(len(shooting.h), every, -1).mean(axis=1)
+    return q[::every], v[::every], u
