@@ -124,6 +124,7 @@ def plan(arguments: Namespace) -> Report:
     """
     robot = load_robot(arguments)
     q0, v0 = state_of(robot, arguments, robot.point, robot.start)
+    guess = fflin.Trajectory.load(arguments.guess, robot) if arguments.guess else None
     motion = fflin.plan(
         robot,
         point_of(robot, arguments, "target_")[:2],
@@ -135,6 +136,7 @@ def plan(arguments: Namespace) -> Report:
         limits=limits_of_options(arguments),
         R=once("--r", arguments.r) or None,
         free=arguments.free_end,
+        guess=guess,
     )
     return Report(robot.name, motion, str(motion), {arguments.output_file: motion.save})
 

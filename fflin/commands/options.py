@@ -74,7 +74,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         ROBOT: _SYSTEM,
         "start": _POSE,
         "target": _TARGET,
-        TRAJECTORY: "duration knots hold free-end r limits limit",
+        TRAJECTORY: "duration knots hold free-end r limits limit guess",
         OUTPUT: "output-file",
     },
     "simulate": {
@@ -127,7 +127,7 @@ COMMON = {
     "output-file plot",
     "tvlqr": "trajectory hold strict weights q r bryson sample qf inputs frame output-file",
     "plan": "joint rpy position velocity target-joint target-rpy target-position target-velocity "
-    "duration knots hold free-end r limits limit inputs output-file",
+    "duration knots hold free-end r limits limit guess inputs output-file",
     "simulate": "joint rpy target-joint target-rpy trajectory weights q r sample mpc gain "
     "schedule free limits duration inputs output-file plot html",
     "sweep": "grid random seed range joint velocity inputs output frame engine workers output-file",
@@ -279,6 +279,8 @@ ABOUT: dict[str, str] = {
     "qf": "weight on the final error. The default is the solution of the algebraic Riccati "
     "equation at the last configuration",
     "free-end": "state whose final value is free. NAME is a state, group or pattern",
+    "guess": f"begin the search at the trajectory in FILE: {_SAVED} or .csv; see "
+    "fflin.Trajectory.load. Its time is scaled to --duration",
     "every": "save the state at every N-th integration step; by default N is 1, or larger for long "
     "runs",
     "show": "show only these curves in --plot. NAME is a state, input, group or pattern, such as "

@@ -12,7 +12,8 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
-from fflin.base.validation import Array, ArrayLike, Mask, instance, number, whole
+from fflin.base.validation import Array, ArrayLike, Mask, number, whole
+from fflin.control.optimal.initial_guess import JointMotion, initial_guess
 from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
@@ -50,7 +51,7 @@ def plan(
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     R: Weight | None = None,
     free: Sequence[str] = (),
-    guess: Trajectory | None = None,
+    guess: Trajectory | JointMotion | None = None,
     progress: bool | None = None,
 ) -> Trajectory:
     r"""Plan a low-effort trajectory to a goal within limits, such as a slew or detumbling.
@@ -101,11 +102,19 @@ def plan(
     free : sequence of str
         States whose end value is free, by name, group or pattern:
         ``["r_b", "qdot_m.wheel_*"]``.
-    guess : Trajectory, optional
-        Motion at which the search begins, with its time scaled to the duration. By default, the
-        search begins at a cubic curve from the start to the goal. If joint torques alone act, the
-        system is nonholonomic: only loops of the joints rotate the base. Then give a guess in which
-        the joints move in loops.
+    guess : Trajectory or callable, optional
+        Motion at which the search begins: a trajectory, whose time is scaled to the duration, or a
+        function ``guess(t)`` of the time t [s] from 0 to the duration. The function returns the
+        joint positions (n,) [rad or m] in the order of ``robot.joint_names``, or a mapping {joint
+        or pattern: position}; joints that it does not name move on a cubic curve from the start to
+        the goal. Continuous joints may have angles beyond pi. If the inputs are torques between
+        bodies of the robot, the base moves as the conserved momentum requires. Otherwise the base
+        moves on the cubic curve.
+
+        By default, the search begins at a cubic curve from the start to the goal. If all inputs are
+        joint torques, the system is nonholonomic, and the base reaches most attitudes only if the
+        joints move in loops. Then the search begins at loops of the joints that rotate the base to
+        the attitude of the goal. The loops stay within the limits of the joints if possible.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
         violation on stderr. By default, they are shown for long runs if stderr is a terminal.
@@ -183,7 +192,7 @@ def plan(
         cost = held[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
-        first = shooting.guess(start, end) if guess is None else _guessed(shooting, guess, start)
+        first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
         made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u
@@ -214,22 +223,6 @@ class _Made(NamedTuple):
     def reached(self) -> bool:
         """Whether the motion ends at the goal and is within the limits at the knots."""
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
-
-
-def _guessed(shooting: Shooting, guess: object, start: Point) -> tuple[Array, Array, Array]:
-    """Return knots q, v and inputs u of a given motion, at the times of the plan."""
-    motion = instance("guess", guess, Trajectory, "a fflin.Trajectory")
-    robot = shooting.state.robot
-    if (motion.robot.nq, motion.robot.nv) != (robot.nq, robot.nv) or (
-        input_keys(motion.actuation) != input_keys(Actuation(shooting.state))
-    ):
-        raise InputError("guess is a motion of a robot with other joints or inputs")
-    fraction = shooting.t / shooting.t[-1]
-    pace = (motion.t[-1] - motion.t[0]) / shooting.t[-1]
-    q, v, u = motion.points(motion.t[0] + fraction * (motion.t[-1] - motion.t[0]))
-    q, v = q.copy(), pace * v
-    q[0], v[0] = start
-    return q, v, u.copy()
 
 
 def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
@@ -295,7 +288,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
         "give a longer duration, wider limits or more knots, or leave the final value of some "
         "states free with `free` (--free-end)"
     )
-    internal = all(isinstance(each, JointTorque | ReactionWheel) for each in robot.inputs)
+    internal = all(isinstance(item, JointTorque | ReactionWheel) for item in robot.inputs)
     if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
         advice = (
             "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
@@ -307,8 +300,8 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     ):
         advice = (
             "joint torques alone rotate the base only if the joints move in loops (the system is "
-            "nonholonomic); give a `guess` in which the joints move in loops, or leave q_b free "
-            "with `free` (--free-end)"
+            "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
+            "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "

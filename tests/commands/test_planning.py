@@ -1,6 +1,7 @@
 """The commands plan and equilibrium, simulate --mpc, and the names of the two time steps."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -29,6 +30,26 @@ def test_a_plan_is_followed(tmp_path):
     # One percent of the displacement.
     assert np.abs(fflin.Motion.load(tmp_path / "m.npz").q[-1] - end).max() < 0.003
     assert "--duration" in refused("plan", ROBOT)
+
+
+@pytest.mark.exhaustive
+def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
+    """From a plan, the search needs fewer iterations; the file is not overwritten."""
+    locked = ("--lock", "joint_2", "--lock", "joint_3")
+    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    command = ("plan", ROBOT, *locked, *target, "--limit", "tau_m=0.5")
+    guess, iterations, efforts = (), [], []
+    for name in ("first.csv", "again.csv"):
+        code, out, err = run(*command, *guess, "-o", name, cwd=tmp_path)
+        assert code == 0, err
+        found = re.search(r"effort (\S+), KKT residuals\s+after (\d+) iterations", out)
+        efforts.append(float(found[1]))
+        iterations.append(int(found[2]))
+        guess = ("--guess", "first.csv")
+    assert iterations[1] < iterations[0] and efforts[1] <= efforts[0]
+    code, _, err = run(*command, "--guess", "first.csv", "-o", "first.csv", cwd=tmp_path)
+    assert code != 0 and "first.csv" in err
+    assert "missing.csv" in refused(*command, "--guess", "missing.csv")
 
 
 WHEELS = """

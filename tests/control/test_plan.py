@@ -9,7 +9,9 @@ from scipy.optimize import minimize
 
 import fflin
 from fflin.control.optimal import plan_search
+from fflin.control.optimal.floating_base import FloatingBase
 from fflin.control.optimal.shooting import Shooting
+from fflin.dynamics.impact import momentum_of
 from tests.support.marks import exhaustive
 from tests.support.messages import any_wording
 from tests.support.speeds import between_knots, largest_speeds
@@ -574,8 +576,153 @@ def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(loop, mo
     robot, _ = loop
     monkeypatch.setattr(plan_search, "_MOST", 3)
     goal = turned(robot, 0.5, (0.0, 1.0, 0.0))
+    options = {"knots": 6, "free": FREE_OF_JOINTS, "limits": {"q_m": 0.1}}
     with any_wording(), pytest.raises(fflin.InputError, match="move in loops"):
-        fflin.plan(robot, (goal, None), 5.0, knots=6, free=FREE_OF_JOINTS)
+        fflin.plan(robot, (goal, None), 5.0, **options)
+
+
+def circle(t):
+    """Positions of two joints that move in a circle within 10 s, from and to rest."""
+    s = t / 10.0
+    phase = 2.0 * np.pi * s**2 * (3.0 - 2.0 * s)
+    return 1.2 * np.array([1.0 - np.cos(phase), np.sin(phase)])
+
+
+@pytest.fixture(scope="module")
+def pitched(loop):
+    """A configuration that the joints reach by a circle; the base has rotated by 7 deg."""
+    robot, _ = loop
+    state, t = fflin.StateMap(robot, frame="local"), np.linspace(0.0, 10.0, 401)
+    joints = circle(t).T
+    base = FloatingBase(state, (robot.neutral(), np.zeros(robot.nv)))
+    R = base.rotations(t, joints)
+    q, _ = base.motion(t, joints, 0.0 * joints, R)
+    assert np.abs(pin.log3(R[-1])).max() > np.deg2rad(7.0)
+    return q[-1]
+
+
+def largest_change_of_momentum(robot, motion):
+    """Return how much the momentum may change, if each interval has an error of 1e-6 m/s."""
+    return 1e-6 * (len(motion.t) - 1) * pin.computeTotalMass(robot.model)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("free", [FREE_OF_JOINTS, []])
+def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched, free):
+    robot, _ = loop
+    with any_wording():
+        motion = fflin.plan(robot, (pitched, None), 10.0, knots=11, free=free, limits=None)
+    assert missed(robot, motion, pitched) < 1e-6 and motion.residual.max() < 1e-6
+    momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    assert np.abs(momenta).max() < largest_change_of_momentum(robot, motion)
+
+
+@pytest.mark.exhaustive
+def test_loops_add_to_the_rotation_by_the_conserved_momentum(loop):
+    robot, _ = loop
+    v0 = fflin.velocity(robot, {"omega_b.y": 0.02, "joint_1": 0.05})
+    goal = turned(robot, -0.2, (0.0, 1.0, 0.0))
+    options = {"v0": v0, "knots": 11, "free": FREE_OF_JOINTS, "limits": None}
+    with any_wording():
+        motion = fflin.plan(robot, (goal, None), 10.0, **options)
+    assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:]).max() < 1e-6
+    assert motion.residual.max() < 1e-6
+    momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    change = np.abs(np.subtract(momenta, momenta[0])).max()
+    assert np.abs(momenta[0]).max() > 1.0 and change < largest_change_of_momentum(robot, motion)
+
+
+@pytest.mark.exhaustive
+def test_joints_reorient_a_legged_robot_in_flight():
+    robot = fflin.load("solo12", lock=["*_HAA"], inputs=[fflin.JointTorque("*")])
+    legs = {"*_HFE": 0.8, "*_KFE": -1.6}
+    start, goal = fflin.configuration(robot, legs), turned(robot, 0.17, (0.0, 1.0, 0.0), legs)
+    with any_wording():
+        motion = fflin.plan(robot, (goal, None), 1.0, q0=start, knots=11, free=FREE_OF_JOINTS)
+    assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:]).max() < 1e-6
+    assert np.abs(motion.v[-1][6:]).max() < 1e-6 and motion.residual.max() < 1e-6
+
+
+@pytest.fixture
+def first_guess(monkeypatch):
+    """Return a function that plans, and returns the knots q, v and the inputs of the guess."""
+
+    def guessed(robot, *args, **options):
+        guesses = []
+
+        def record(search, guess):
+            guesses.append(guess)
+            raise fflin.InputError("the guess is known")
+
+        monkeypatch.setattr("fflin.control.plan._least", record)
+        with any_wording(), pytest.raises(fflin.InputError, match="guess is known"):
+            fflin.plan(robot, *args, **options)
+        return guesses[0]
+
+    return guessed
+
+
+def test_a_function_is_a_guess_whose_base_conserves_momentum(loop, pitched, first_guess):
+    robot, _ = loop
+    options = {"knots": 21, "free": FREE_OF_JOINTS, "limits": None, "hold": "linear"}
+    q, v, u = first_guess(robot, (pitched, None), 10.0, guess=circle, **options)
+    state = fflin.StateMap(robot)
+    t = np.linspace(0.0, 10.0, 21)
+    assert state.joint_positions(q) == pytest.approx(circle(t).T, abs=1e-12)
+    # The joint motion is integrated in 400 steps both here and in `pitched`.
+    assert np.abs(pin.difference(robot.model, pitched, q[-1])).max() < 1e-9
+    momenta = [momentum_of(robot, *point) for point in zip(q, v, strict=True)]
+    assert np.abs(momenta).max() < 1e-9
+    # The inputs are from differences of the rates and linear between knots, so that the gaps are of
+    # the order h^3.
+    fine = first_guess(robot, (pitched, None), 10.0, guess=circle, **options | {"knots": 41})
+    gaps = []
+    for knots in ((q, v, u), fine):
+        shooting = Shooting(robot, np.linspace(0.0, 10.0, len(knots[0])), held=False)
+        gaps.append(np.abs(shooting.missed(*knots[:2], shooting.motions(*knots))).max())
+    assert gaps[1] < 0.3 * gaps[0]
+
+
+def test_a_function_may_name_joints(loop, pitched, first_guess):
+    robot, _ = loop
+    goal = fflin.configuration(robot, {"joint_1": 0.4})
+    options = {"knots": 5, "free": FREE_OF_JOINTS, "limits": None}
+    q, *_ = first_guess(robot, (goal, None), 2.0, guess=lambda t: {"joint_2": 3.5 * t}, **options)
+    joints = fflin.StateMap(robot).joint_positions(q)
+    by_name = dict(zip(robot.joint_names, joints.T, strict=True))
+    s = np.linspace(0.0, 1.0, 5)
+    assert by_name["joint_1"] == pytest.approx(0.4 * s**2 * (3.0 - 2.0 * s), abs=1e-12)
+    assert np.unwrap(by_name["joint_2"]) == pytest.approx(7.0 * s, abs=1e-12)
+
+
+def test_with_a_base_torque_the_base_of_a_guess_moves_to_the_goal(first_guess):
+    robot = fflin.load("planar_detumble")
+    goal = turned(robot, 0.5, (0.0, 1.0, 0.0), at=(0.3, 0.0, 0.0))
+    options = {"knots": 7, "limits": None}
+    q, v, u = first_guess(robot, (goal, None), 4.0, **options)
+    bent = first_guess(robot, (goal, None), 4.0, guess=lambda t: 0.1 * t * np.ones(3), **options)
+    assert np.array_equal(bent[0][:, :7], q[:, :7])
+    joints = fflin.StateMap(robot).joint_positions(bent[0])
+    assert joints == pytest.approx(0.1 * np.linspace(0.0, 4.0, 7)[:, None] * np.ones(3), abs=1e-12)
+    assert bent[1][1:, 6:] == pytest.approx(0.1 * np.ones((6, 3)), abs=1e-9)
+    assert not np.allclose(bent[2], u) and (v[:, 6:] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("guess", "words"),
+    [
+        (lambda t: np.zeros(3), r"guess\(0\) has shape \(3,\), expected \(2,\)"),
+        (lambda t: [t, np.inf if t > 1.0 else 0.0], r"guess\(1.*\)\[1\] is inf"),
+        (lambda t: {"joint_9": t}, "joint_9"),
+        (lambda t: {"joint_1": "far"}, r"guess\(0\) of joint"),
+        (lambda t, q: np.zeros(2), r"expected a function of \(t\)"),
+        (3.0, "guess has type float"),
+    ],
+)
+def test_a_guess_that_is_no_motion_of_the_joints_is_refused(loop, guess, words):
+    robot, _ = loop
+    with pytest.raises(fflin.FflinError, match=words):
+        fflin.plan(robot, (None, None), 5.0, knots=5, guess=guess)
 
 
 ARM = {"tau_b": 6.0, "F_b": 3.5, "tau_m": 3.0}

@@ -319,7 +319,7 @@ class Search(NamedTuple):
             return None
         try:
             ends, inside = self.shooting.jacobians(trial.q, trial.v, trial.u, self.parts)
-        except InputError:  # the motion has diverged
+        except (InputError, np.linalg.LinAlgError):  # the motion has diverged
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
         # x[k], u[k] and u[k + 1].

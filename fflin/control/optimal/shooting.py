@@ -197,12 +197,17 @@ class Shooting:
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end
+        return q, v, self.inputs(self.t, q, v)
+
+    def inputs(self, t: Array, q: Array, v: Array) -> Array:
+        """Return inputs (K, nu) that approximately cause a motion q (K, nq), v (K, nv)."""
         u = np.zeros((len(q), len(self._linearizer().u0)))
-        wanted = np.gradient(v, self.t, axis=0) - self._aba.accelerations(q, v, u)
+        wanted = np.gradient(v, t, axis=0) - self._aba.accelerations(q, v, u)
         by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
         rates = self.state.velocities(wanted)[..., None]
         # The wheels accelerate as needed. Wheels are light, so with their rows, the least-squares
         # problem would be about standing wheels instead of the motion of the base and the joints.
         kept = np.delete(np.arange(self.state.nx // 2), self.wheels)
         by_u, rates = by_u[:, kept], rates[:, kept]
-        return q, v, (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        inputs: Array = (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        return inputs
