@@ -186,7 +186,8 @@ def plan(
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
         # Weights of the knots in the integral of the effort: the hold times if the inputs are held,
         # otherwise the weights of the trapezoidal rule.
-        h, inputs = shooting.h, np.array((low, high))
+        h = shooting.h
+        inputs = np.array((low, high))
         held = np.append(h, h[-1] if shooting.held else 0.0)
         held = held if shooting.held else 0.5 * (held + held[::-1])
         cost = held[:, None] * weights
@@ -233,7 +234,10 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     An attempt that reaches the goal is better than an attempt that does not. If both or neither
     reach the goal, the attempt with the smaller violation is better.
     """
-    shooting, bounds, cost, found = search.shooting, search.bounds, search.cost, list[_Made]()
+    shooting = search.shooting
+    bounds = search.bounds
+    cost = search.cost
+    found = list[_Made]()
     unit = float((cost * guess[2] ** 2).sum() or cost.sum())
     cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
@@ -262,7 +266,8 @@ def _require_within(
 
     `asked` (nx,) is True for the states to check.
     """
-    values, state = shooting.limited_values(*point), shooting.state
+    values = shooting.limited_values(*point)
+    state = shooting.state
     outside = [
         f"{state.names[i]} is {values[i]:.4g} {state.units[i]}, limit {limit:.4g} {state.units[i]}"
         for side, limits in zip((-1.0, 1.0), bounds, strict=True)
@@ -342,7 +347,8 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
     `limits` (2, k) contains the lower and upper limits of all states and inputs.
     """
     wheels = {shooting.state.names[i].removeprefix("q_m.") for i in shooting.wheels}
-    state, values = shooting.state, np.hstack((shooting.limited_values(made.q, made.v), made.u))
+    state = shooting.state
+    values = np.hstack((shooting.limited_values(made.q, made.v), made.u))
     names, units = state.names + input_keys(actuation), state.units + actuation.units
     bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
     shares = np.abs(values) / np.where(bound > 0.0, bound, np.inf)

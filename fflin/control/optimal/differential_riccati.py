@@ -84,7 +84,8 @@ def _constant(coefficients: Array, h: Array) -> Array:
     # costates get the inverse scales.
     _, (scale, _) = matrix_balance(sizes, permute=False, separate=True)
     unit = np.sqrt(scale[:n] / scale[n:])
-    of_costs, of_states = np.outer(unit, unit), unit / unit[:, None]
+    of_costs = np.outer(unit, unit)
+    of_states = unit / unit[:, None]
     A, S, Q = A * of_states, S / of_costs, Q * of_costs
     H = np.block([[A, -S], [-Q, -A.mT]]) * h[:, None, None]
     size = float(np.abs(H).sum(axis=-2).max())
@@ -106,7 +107,9 @@ _Interval = tuple[float, float, Array, Array]
 
 def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     """Return the k intervals between knots (k + 1,), with transitions and coefficients."""
-    a, b, count = knots[:-1], knots[1:], len(knots) - 1
+    a = knots[:-1]
+    b = knots[1:]
+    count = len(knots) - 1
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
     h = np.concatenate((b, middle, b)) - start
@@ -129,7 +132,9 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
         pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
             start, end, (whole, early, late), (at_start, at_end) = pending.pop()
-            P, middle, error = values[-1], 0.5 * (start + end), math.inf
+            P = values[-1]
+            middle = 0.5 * (start + end)
+            error = math.inf
             # The coefficients of a long step may be indefinite, because beta in (10.3) is negative.
             # The step may then fail, and shorter steps are tried.
             with suppress(np.linalg.LinAlgError):
@@ -161,7 +166,10 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
     # Each stage has two matrices. The first (nx + nu, nx + nu) is the cost matrix for the error at
     # the start of a sample and the input. The second (nx, nx + nu) maps this error and the input to
     # the next error.
-    nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
+    nx = len(P)
+    gains = list[Array]()
+    costs = [P]
+    worst = 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole
         K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])

@@ -35,7 +35,9 @@ class FloatingBase:
 
     def __init__(self, state: StateMap, start: Point) -> None:
         robot = state.robot
-        self._state, self._model, self._data = state, robot.model, robot.create_data()
+        self._state = state
+        self._model = robot.model
+        self._data = robot.create_data()
         self._spread = np.array([state.spread(row) for row in np.eye(6 + robot.n)]).T
         self._gravity = np.array(robot.gravity)
         q, v = start

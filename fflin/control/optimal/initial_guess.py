@@ -81,7 +81,8 @@ def _of_trajectory(shooting: Shooting, motion: Trajectory, start: Point) -> Knot
     fraction = shooting.t / shooting.t[-1]
     pace = (motion.t[-1] - motion.t[0]) / shooting.t[-1]
     q, v, u = motion.points(motion.t[0] + fraction * (motion.t[-1] - motion.t[0]))
-    q, v = q.copy(), pace * v
+    q = q.copy()
+    v = pace * v
     q[0], v[0] = start
     return q, v, u.copy()
 
@@ -89,10 +90,12 @@ def _of_trajectory(shooting: Shooting, motion: Trajectory, start: Point) -> Knot
 def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point) -> Knots:
     """Return the knots and inputs of a motion whose joint positions a function returns."""
     function("guess", guess, "(t)")
-    robot, times = shooting.state.robot, _fine_times(shooting)
+    robot = shooting.state.robot
+    times = _fine_times(shooting)
     joints = _straight(shooting, start, end, times)
     for t, row in zip(times.tolist(), joints, strict=True):
-        what, value = f"guess({t:.4g})", guess(t)
+        what = f"guess({t:.4g})"
+        value = guess(t)
         if isinstance(value, Mapping):
             positions = numbers(what, value, "joint", f"{what} of joint")
             by_name = by_joint(positions, robot.joint_names, robot.joint)
@@ -122,7 +125,9 @@ def _with_loops(
 ) -> Knots:
     """Return knots and inputs of a motion whose joint loops rotate the base to the goal."""
     state = shooting.state
-    robot, groups, base = state.robot, state.groups, FloatingBase(state, start)
+    robot = state.robot
+    groups = state.groups
+    base = FloatingBase(state, start)
     times = np.linspace(0.0, shooting.t[-1], STEPS * MOST_CIRCLES + 1)
     motors = [item.joint for item in robot.inputs if isinstance(item, JointTorque)]
     moved = [robot.joint_names.index(name) for name in motors]
@@ -178,7 +183,8 @@ def _along(
     The base moves as the conserved momentum requires. If `base` is None, the base moves on the
     curve of the default guess.
     """
-    state, every = shooting.state, (len(times) - 1) // len(shooting.h)
+    state = shooting.state
+    every = (len(times) - 1) // len(shooting.h)
     rates = CubicSpline(times, joints)(times, 1)
     if base is None:
         q, v, _ = shooting.guess(start, end)
@@ -187,7 +193,8 @@ def _along(
         state.robot.follow(q.T)
         nu = state.velocities(v)
         nu[:, 6:] = rates[::every]
-        q[0], v = start[0], state.spread(nu)
+        q[0] = start[0]
+        v = state.spread(nu)
         v[0] = start[1]
         return q, v, shooting.inputs(shooting.t, q, v)
     q, v = base.motion(times, joints, rates, base.rotations(times, joints))

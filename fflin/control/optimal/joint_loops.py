@@ -194,7 +194,9 @@ class Loops:
         near = _NEAR * float(np.linalg.norm(self.error(self.path)))
         postures = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, len(self.moved)))
         postures[0] = 0.0
-        best, least, circles = self.path, np.inf, 1
+        best = self.path
+        least = np.inf
+        circles = 1
         while circles <= most_circles and least > near:
             every = MOST_CIRCLES // circles
             coarse = replace(self, t=self.t[::every], path=self.path[::every])

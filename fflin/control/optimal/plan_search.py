@@ -147,12 +147,16 @@ class Search(NamedTuple):
         under the last inputs, and None. The effort is the sum of ``cost * u**2``. `iterations` is
         the number of earlier iterations.
         """
-        shooting, cost, u = self.shooting, self.cost, np.clip(u, *self.limits)
+        shooting = self.shooting
+        cost = self.cost
+        u = np.clip(u, *self.limits)
         shooting.refine(q, v, u, _SEEKS)
-        wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
-        near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
-        first, trial = near, self._trial(q, v, u)
-        limited, price, left = self._exceeding(trial), 0.0 * trial.missed, list[float]()
+        near = self._damping_of_steps() / len(q)
+        first = near
+        trial = self._trial(q, v, u)
+        limited = self._exceeding(trial)
+        price = 0.0 * trial.missed
+        left = list[float]()
         iteration = 0
         for iteration in range(_MOST):
             self._report(f"iteration {iteration + 1}", trial, limited)
@@ -192,7 +196,8 @@ class Search(NamedTuple):
             if small or gain >= _MUCH * saved:
                 near = np.maximum(_LESS * near, _LEAST * first)
             trial = moved
-            known, limited = limited, limited | exceeding
+            known = limited
+            limited = limited | exceeding
             if converged and (limited == known).all():
                 break
         iterations += iteration + 1
@@ -203,6 +208,13 @@ class Search(NamedTuple):
             return dearer.best(trial.q, trial.v, trial.u, iterations)
         trial = self._closed(trial, limited, first, left)
         return trial, self._optimality(trial, limited, first, iterations)
+
+    def _damping_of_steps(self) -> Array:
+        """Return the relative Levenberg-Marquardt cost of a step of each state (nx,)."""
+        nx = self.shooting.state.nx
+        wheels = list(self.shooting.wheels)
+        wheels += [nx // 2 + i for i in wheels]
+        return np.where(np.isin(range(nx), wheels), _OF_WHEELS, 1.0)
 
     def _optimality(
         self, trial: Trial, limited: Mask, near: Array, iterations: int
@@ -262,12 +274,13 @@ class Search(NamedTuple):
         """
         # A correction solves the quadratic program again, with the gaps and violations at the end
         # of the step added to the models.
-        before, missed, effort = (
-            self._merit(trial, price, limited),
-            trial.missed,
-            self.cost * trial.u,
-        )
-        best, most, gap, exceeding = None, -np.inf, np.inf, limited
+        before = self._merit(trial, price, limited)
+        missed = trial.missed
+        effort = self.cost * trial.u
+        best = None
+        most = -np.inf
+        gap = np.inf
+        exceeding = limited
         corrections = _MOST_CORRECTIONS if step.outside <= _HOPELESS else 0
         for correction in range(1 + corrections):
             u = np.clip(trial.u + step.du, *self.limits)
@@ -280,7 +293,8 @@ class Search(NamedTuple):
                 break
             if end.gap > gap:  # the corrections do not converge
                 break
-            gap, missed = end.gap, missed + end.missed
+            gap = end.gap
+            missed = missed + end.missed
             room = models.room(end) + step.moved
             again = self._step(trial, models, near, effort, missed, room)
             if again is None:
@@ -290,7 +304,8 @@ class Search(NamedTuple):
 
     def _report(self, what: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
-        cost, inside = float((self.cost * trial.u**2).sum()), excess(trial.inside)[limited]
+        cost = float((self.cost * trial.u**2).sum())
+        inside = excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
         self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
 
@@ -298,7 +313,8 @@ class Search(NamedTuple):
         shooting = self.shooting
         motions = shooting.motions(q, v, u)
         knots = self.bounds[:, None] - shooting.limited_values(q, v)
-        knots[0, 0], knots[1, 0] = -np.inf, np.inf
+        knots[0, 0] = -np.inf
+        knots[1, 0] = np.inf
         to_end = shooting.between((q[-1], v[-1]), self.end)
         knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
         tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
@@ -348,7 +364,10 @@ class Search(NamedTuple):
         `effort` is the gradient of the effort. The gaps `missed` and the distances `room` from the
         limits are by default those of the trial.
         """
-        u, nx, ends, rows = trial.u, len(near), models.ends, models.rows
+        u = trial.u
+        nx = len(near)
+        ends = models.ends
+        rows = models.rows
         missed = trial.missed if missed is None else missed
         room = models.room(trial) if room is None else room
         prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nx))
@@ -384,7 +403,8 @@ class Search(NamedTuple):
         The steps also remove the violations of the goal and the limits. If a gap remains, return
         the motion under the last inputs.
         """
-        shooting, last = self.shooting, _NEARLY
+        shooting = self.shooting
+        last = _NEARLY
         shooting.refine(trial.q, trial.v, trial.u, _FLIES)
         trial = self._trial(*trial[:3])
         for _ in range(_MOST_CLOSING):
@@ -392,7 +412,8 @@ class Search(NamedTuple):
             self._report("closing the gaps", trial, limited)
             if trial.gap <= _MEETS and trial.outside(limited) <= _ENDS:
                 one = self._flown(trial.u)
-                limited, before = limited | self._exceeding(one), last
+                limited = limited | self._exceeding(one)
+                before = last
                 last = one.outside(limited)
                 if last <= _ENDS:
                     return one
@@ -481,7 +502,8 @@ def solve_stages(
     """
     piqp = optional_package("piqp", "this needs the solver PIQP", "mpc")
     (N, nx, _), (knots, nw), m = ends.shape, g.shape, len(prices)
-    size, of_rows = np.tile(scale, knots), 1.0 / np.tile(scale[:nx], knots)
+    size = np.tile(scale, knots)
+    of_rows = 1.0 / np.tile(scale[:nx], knots)
     none = sp.csc_array((N * nx, nw))
     after = np.concatenate((np.tile(-np.eye(nx), (N, 1, 1)), ends[:, :, nw:]), axis=2)
     links = sp.hstack((sp.block_diag(ends[:, :, :nw]), none))
@@ -496,7 +518,9 @@ def solve_stages(
     bounds[:, :, nx:] = limits / scale[nx:]
     low, high = bounds.reshape(2, -1)
     # Each soft limit has a slack s: ``rows w + s >= room[0]`` and ``rows w - s <= room[1]``.
-    soft, slack, open_ = rows @ sp.diags_array(size), sp.eye_array(m), np.full(m, np.inf)
+    soft = rows @ sp.diags_array(size)
+    slack = sp.eye_array(m)
+    open_ = np.full(m, np.inf)
     G = sp.vstack((sp.hstack((soft, slack)), sp.hstack((soft, -slack))), format="csc")
     of_G = np.append(room[0], -open_), np.append(open_, room[1])
     solver = piqp.SparseSolver()

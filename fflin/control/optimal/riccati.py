@@ -12,7 +12,8 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array, Values
 
-_EPS, _TINY = float(np.finfo(float).eps), 1e-300
+_EPS = float(np.finfo(float).eps)
+_TINY = 1e-300
 
 # A solution with at most this relative residual is accepted, and no other method is tried. If
 # rounding alone causes a larger residual (see `_Trial`), this larger residual is accepted, because
@@ -298,7 +299,8 @@ def _refined(
             break
         if modes is None:
             F = equation.A - equation.B @ equation.gain(trial.P)
-            modes, fresh = ModalMatrix.of(F, equation.discrete), True
+            modes = ModalMatrix.of(F, equation.discrete)
+            fresh = True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution, a Newton step may improve P although the residual rises. Such a
@@ -349,7 +351,9 @@ class ModalMatrix:
     """Modes V (n, n) of a real matrix F; conjugate modes are adjacent columns."""
 
     def __init__(self, V: Values, poles: Values, discrete: bool) -> None:
-        self.V, self.inverse, self.values = V, np.linalg.inv(V), poles
+        self.V = V
+        self.inverse = np.linalg.inv(V)
+        self.values = poles
         across = poles.conj()[:, None]
         self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
 
@@ -379,7 +383,8 @@ class ModalMatrix:
         # bounds the relative errors of the eigenvalues.
         if np.linalg.norm(M / np.abs(values)) > 1e-7:
             return np.linalg.eigvals(F)
-        real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
+        real = self.values.imag == 0.0
+        first = np.flatnonzero(self.values.imag)[::2]
         values[real] = values[real].real
         values[first + 1] = values[first].conj()
         return values
@@ -415,7 +420,8 @@ def second_order_loop(
         return None
     # x = T (p, dp/dt)
     T = np.zeros((nx, nx))
-    T[:m, :m], T[m:, m:] = A12 @ Ls, Ls
+    T[:m, :m] = A12 @ Ls
+    T[m:, m:] = Ls
     plain = not (A11.any() or A[m:].any())
     if not plain:
         T[m:, :m] = -inverse @ A11 @ T[:m, :m]

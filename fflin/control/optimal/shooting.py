@@ -47,7 +47,9 @@ class Shooting:
     def __init__(
         self, robot: Robot, t: Array, held: bool, wheels: Iterable[str] | None = None
     ) -> None:
-        self.state, self.t, self.held = StateMap(robot, frame="local"), t, held
+        self.state = StateMap(robot, frame="local")
+        self.t = t
+        self.held = held
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
@@ -74,9 +76,14 @@ class Shooting:
 
         By default, each interval has the number of steps that `refine` found, but at least _STEPS.
         """
-        q, v, first, steps = q[:-1], v[:-1], u[:-1], steps or max(self.steps, _STEPS)
-        h, change = self.h[0], 0.0 * first if self.held else np.diff(u, axis=0)
-        method, points = CommutatorFree4(self.state.robot.model, h / steps, len(q)), [(q, v)]
+        q = q[:-1]
+        v = v[:-1]
+        first = u[:-1]
+        steps = steps or max(self.steps, _STEPS)
+        h = self.h[0]
+        change = 0.0 * first if self.held else np.diff(u, axis=0)
+        method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
+        points = [(q, v)]
 
         def rate(t: float, q: Array, v: Array) -> Array:
             return self._aba.accelerations(q, v, first + t / h * change)
@@ -105,7 +112,8 @@ class Shooting:
         The values of the base are zero.
         """
         state = self.state
-        n, values = state.robot.n, np.zeros((*q.shape[:-1], state.nx))
+        n = state.robot.n
+        values = np.zeros((*q.shape[:-1], state.nx))
         values[..., 6 : 6 + n] = state.joint_positions(q)
         values[..., state.nx - n :] = state.velocities(v)[..., 6:]
         return values
@@ -127,7 +135,8 @@ class Shooting:
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
             self.steps *= 2
-            before, missed = missed, self.missed(q, v, self.motions(q, v, u, self.steps))
+            before = missed
+            missed = self.missed(q, v, self.motions(q, v, u, self.steps))
             if np.abs(missed - before).max() <= accuracy:
                 break
 
@@ -141,7 +150,9 @@ class Shooting:
         """
         # Integrate dZ/dt = A Z + `driven` along the motions by Runge-Kutta steps. Z contains the
         # Jacobians of all intervals, and `driven` contains B for the inputs at both knots.
-        N, nx, nu = len(self.h), len(self._size), u.shape[1]
+        N = len(self.h)
+        nx = len(self._size)
+        nu = u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
         late = np.arange(2 * steps + 1) / (2.0 * steps)
@@ -156,10 +167,13 @@ class Shooting:
         driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=3)
         h = self.h[0] / steps
         Z = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
-        fractions, inside = np.arange(1, parts) / parts * steps, list[Array]()
+        fractions = np.arange(1, parts) / parts * steps
+        inside = list[Array]()
         for step in range(steps):
             F = [(A[:, k], driven[:, k]) for k in range(2 * step, 2 * step + 3)]
-            total, rate, before = np.zeros_like(Z), np.zeros_like(Z), Z
+            total = np.zeros_like(Z)
+            rate = np.zeros_like(Z)
+            before = Z
             for i, fraction, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
                 rate = F[i][0] @ (Z + fraction * h * rate) + F[i][1]
                 total = total + weight * rate
@@ -173,8 +187,10 @@ class Shooting:
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots q, v on a cubic curve between two points, and approximate inputs u."""
-        model, T = self.state.robot.model, self.t[-1]
-        s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
+        model = self.state.robot.model
+        T = self.t[-1]
+        s = self.t[:, None] / T
+        rates = np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
         difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
