@@ -20,6 +20,7 @@ HEAR = "from tests.support.messages import hear\n"
     [
         ("dt is 0.5 s", "dt is 1e-6 s", True),
         ("drift -1.23e-16 of 4,010 m", "drift 7.1e-15 of 4.0 m", True),
+        ("dt is 0, expected 1,000 or 2", "dt is 1e-3, expected 4 or 5", True),
         ("no joint 'a' of 6", "no joint 'b_1' of 7", True),
         ("the robot's base and the arm's tip", "the robot's base or the arm's tip", False),
         ("12 states", "12 states, 3 inputs", False),

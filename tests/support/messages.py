@@ -41,7 +41,7 @@ VARIES = [
     (r"(maximum recursion depth exceeded)[a-zA-Z ]*", r"\1"),
 ]
 LONGEST = 400
-NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+NUMBER = re.compile(r"-?\d+(?:,\d{3})*(?:\.\d+)?(?:e[+-]?\d+)?")
 QUOTED = re.compile(r"(?<!\w)'[^']*'(?!\w)")
 
 
