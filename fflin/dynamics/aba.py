@@ -15,8 +15,8 @@ def scaled_inverse(matrix: Array) -> Array:
     Without the scaling, a matrix of coordinates of very different inertia would lose digits.
     """
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
-    found: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
-    return found
+    inverse: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
+    return inverse
 
 
 class Aba:
@@ -61,11 +61,11 @@ class Aba:
         if self._resists:
             forces += self._passive_force(q, v)
         tau = state.lift(forces.T).T
-        found = np.empty_like(v)
+        rates = np.empty_like(v)
         for k, point in enumerate(zip(q, v, tau, strict=True)):
             wrenches = self.actuation.wrenches(u[k]) or self._none
-            found[k] = pin.aba(self._model, self._data, *point, wrenches)
-        return found
+            rates[k] = pin.aba(self._model, self._data, *point, wrenches)
+        return rates
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms.
@@ -93,7 +93,7 @@ class Aba:
         stiffness, damping, _ = state.robot.springs
         tau = state.lift(self.actuation.fixed @ u + self._passive_force(q, v))
         field = self.field
-        here = q, v
+        given_point = q, v
         if field:
             q, v = field.near(q, v)
         external = self._wrenches(q, v, u)
@@ -121,7 +121,7 @@ class Aba:
         if field:
             pin.computeJointJacobians(self._model, self._data, q)
             by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
-            field.add_turning(*here, by_q, by_v)
+            field.add_turning(*given_point, by_q, by_v)
         by_u = []
         for unit, forces in zip(np.eye(len(u)), self.actuation.fixed.T, strict=True):
             wrenches = self.actuation.wrenches(unit) or self._none

@@ -339,8 +339,7 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
     """
     at, to = x[:, :3], target[..., :3]
     w, d = (
-        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
-        for each in (at, to)
+        np.sqrt(np.maximum(0.0, 1.0 - (q_b * q_b).sum(axis=-1, keepdims=True))) for q_b in (at, to)
     )
     return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(axis=-1, keepdims=True)
 
@@ -375,8 +374,8 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
     x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
     R = R_target @ R
     for rows in _in_reference(frame, x.shape[1]):
-        own = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
-        x[:, rows] = (R @ own[..., None])[..., 0]
+        in_base_axes = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
+        x[:, rows] = (R @ in_base_axes[..., None])[..., 0]
     return x
 
 

@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
 
     def part(self, rows: slice) -> Sensed:
         """Return views of some rows, such as the rows of one output."""
-        views = [each[rows] for each in self]
+        views = [array[rows] for array in self]
         return Sensed(*views)
 
 

@@ -215,5 +215,5 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     """
     checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))
-    found = by_name("input", checked, keys)
-    return np.array([found.get(index, 0.0) for index in range(len(keys))])
+    value_at = by_name("input", checked, keys)
+    return np.array([value_at.get(index, 0.0) for index in range(len(keys))])

@@ -414,7 +414,7 @@ class Actuation:
         # frame of the joint).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item, own in robot.named_inputs:
+        for item, input_names in robot.named_inputs:
             at = len(columns)
             unit = item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
@@ -427,15 +427,15 @@ class Actuation:
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:
-                columns.append(identity[6 + robot.joint_names.index(own[0])])
+                columns.append(identity[6 + robot.joint_names.index(input_names[0])])
             else:
                 assert isinstance(item, kinds.Thruster | kinds.ReactionWheel)
                 joint, placement = find_frame(robot.model, item.frame)
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            names += own
-            units += [unit] * len(own)
+            names += input_names
+            units += [unit] * len(input_names)
             self.groups.setdefault(item.GROUP, []).extend(range(at, len(columns)))
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -496,9 +496,9 @@ class Actuation:
         return external
 
 
-def selection(names: Sequence[str], of: Sequence[str]) -> Array:
+def selection(names: Sequence[str], known: Sequence[str]) -> Array:
     """Return the matrix S (k, n) that selects k of the n entries of a vector by their names.
 
-    `names` lists the names of the selected entries, and `of` lists the names of all entries.
+    `names` lists the names of the selected entries, and `known` lists the names of all entries.
     """
-    return np.eye(len(of))[[*map(of.index, names)]]
+    return np.eye(len(known))[[*map(known.index, names)]]
