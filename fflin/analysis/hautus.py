@@ -110,8 +110,8 @@ def split_by_poles(
         inside = np.linalg.qr(taken.T, mode="complete")[0][:, len(known) :]
     rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
-        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
-        margin &= found.transformed(inside)
+        lost, step_margin = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
+        margin &= step_margin.transformed(inside)
         if not lost.shape[1]:
             break
         rest = np.hstack((rest, inside @ lost))
@@ -149,7 +149,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
     # Rounding splits a defective zero eigenvalue into several poles, so zero itself is tested
     # first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
-    found: Array = np.zeros((len(A), 0))
+    basis: Array = np.zeros((len(A), 0))
     margin, known = ranks.Margin(), np.zeros(0, dtype=complex)
     for start in candidates:
         pole = complex(start)
@@ -173,9 +173,9 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
         parts = np.real(vectors) if single else np.hstack((vectors.real, vectors.imag))
         # Poles that differ only by rounding error have the same left vectors, so only new
         # directions are added.
-        new = parts - found @ (found.T @ parts)
-        found = np.hstack((found, ranks.image(new, _SUSPICIOUS)[0]))
-    return found, margin
+        new = parts - basis @ (basis.T @ parts)
+        basis = np.hstack((basis, ranks.image(new, _SUSPICIOUS)[0]))
+    return basis, margin
 
 
 def unobservable(
@@ -241,7 +241,7 @@ def unobservable(
         motion = np.vstack((shapes, pole * shapes))
         pair = [pole, pole.conjugate()] if pole.imag else [pole]
         motions += [motion.real, motion.imag][: len(pair)]
-        poles += [each for each in pair for _ in shapes.T]
+        poles += [member for member in pair for _ in shapes.T]
         decay = max(-pole.real / abs(pole) / (1e2 * ranks.EPS * len(system.M)), 0.0)
         decays.append(ranks.Decision(decay, shapes[:, 0]))
     known = [pole for pole, _ in missed]

@@ -130,13 +130,13 @@ class SecondOrder:
         if D.any():
             fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
             A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
-            found = np.linalg.eigvals(A) * fastest
+            poles = np.linalg.eigvals(A) * fastest
         else:
             roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
-            found = np.concatenate((roots, -roots))
+            poles = np.concatenate((roots, -roots))
             zeros = 2 * zeros
-        found = found[np.argsort(np.abs(found))][zeros:]
-        return found[found.imag >= 0.0], margin & other
+        poles = poles[np.argsort(np.abs(poles))][zeros:]
+        return poles[poles.imag >= 0.0], margin & other
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
@@ -166,12 +166,12 @@ def second_order(lin: LinearModel) -> SecondOrder:
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # The norm of each column of S sets the threshold for the entries of this column.
-    each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
+    column_sizes = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
         K=ranks.without_rounding(K @ -N, size, size),
         D=ranks.without_rounding(D @ -np.eye(nv), size, size),
-        S=ranks.without_rounding(S, size, each),
+        S=ranks.without_rounding(S, size, column_sizes),
     )
 
 

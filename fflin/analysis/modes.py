@@ -186,8 +186,10 @@ class Modes:
             if 0.1 < abs(mode.margin) < 10.0
         ]
         if self.modes and not self.modes[0].energy:
-            said = "the kinetic energies of the bodies are unknown, because the model was loaded "
-            notes.append(f"{said}from a file")
+            notes.append(
+                "the kinetic energies of the bodies are unknown, because the model was loaded "
+                "from a file"
+            )
         return tuple(notes)
 
     @property
@@ -210,12 +212,12 @@ class Modes:
         head += f", {counted(others, 'real pole')}" if others else ""
         if not self.equilibrium:
             head += "; not an equilibrium: eigenvalues of a frozen model do not show stability"
-        said = [head]
+        lines = [head]
         if self.unstable:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
-            said.append(f"unstable poles (positive real part): {poles}")
-        said += [f"note: {note}" for note in self.notes]
-        parts = [folded([each]) for each in said]
+            lines.append(f"unstable poles (positive real part): {poles}")
+        lines += [f"note: {note}" for note in self.notes]
+        parts = [folded([line]) for line in lines]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         for mode in self.modes:
             swing = f"{mode.frequency:.6g}", f"{mode.damping_ratio:.4g}"
@@ -332,7 +334,7 @@ def modes(lin: LinearModel) -> Modes:
     weight = np.concatenate((fastest * inertia, inertia))
     pairs, rigid_body = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
     # Pole, shape and margin of each mode
-    found: list[tuple[complex, Complex, float]] = []
+    eigenmodes: list[tuple[complex, Complex, float]] = []
     residual = 0.0
     for scaled_pole, vector, error in pairs:
         if scaled_pole.imag < 0.0:
@@ -348,12 +350,14 @@ def modes(lin: LinearModel) -> Modes:
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shape = np.asarray(shape / shape[largest], complex)
         margin = scaled_pole.real / error
-        found.append((pole, shape, margin))
-    shapes = np.array([shape for _, shape, _ in found], complex).reshape(len(found), 2 * nv)
+        eigenmodes.append((pole, shape, margin))
+    shapes = np.array([shape for _, shape, _ in eigenmodes], complex).reshape(
+        len(eigenmodes), 2 * nv
+    )
     energies = energies_of(lin._robot, lin, shapes)
     listed = [
         Mode(pole, shape, margin > 1.0, margin, energy, strain)
-        for (pole, shape, margin), (energy, strain) in zip(found, energies, strict=True)
+        for (pole, shape, margin), (energy, strain) in zip(eigenmodes, energies, strict=True)
     ]
     return Modes(
         tuple(sorted(listed, key=lambda mode: (abs(mode.pole), mode.pole.real))),
@@ -417,7 +421,7 @@ def energies_of(
     elastic = robot.springs.stiffness[:, None] * np.abs(moved[6:]) ** 2
     names = _body_names(robot)
     bodies = {i for i in range(len(names)) if i + ROOT not in carriers}
-    found: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
+    fractions: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
     for of_bodies, of_springs in zip(kinetic.T, elastic.T, strict=True):
         parts = of_bodies / (of_bodies.sum() or 1.0)
         order = np.argsort(-parts.round(9), kind="stable").tolist()
@@ -425,8 +429,8 @@ def energies_of(
         parts = of_springs / (of_springs.sum() or 1.0)
         order = np.argsort(-parts, kind="stable").tolist()
         strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
-        found.append((energy, strain))
-    return found
+        fractions.append((energy, strain))
+    return fractions
 
 
 def _body_names(robot: Robot) -> list[str]:

@@ -138,8 +138,8 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
         shown = mechanics.outputs_without_rounding(lin, C)
         position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
-        if found := unobservable(system, position, velocity, lin.dt):
-            motions, _, fixed = found
+        if hidden := unobservable(system, position, velocity, lin.dt):
+            motions, _, fixed = hidden
             motions = np.vstack((N @ motions[:nv], motions[nv:]))
             method = "eigenvalues" if system.acting else "closed form"
     if motions is None:
@@ -260,17 +260,17 @@ def _result(
     )
 
 
-def lasting_motions(lin: LinearModel, found: Observability) -> tuple[str, ...]:
+def lasting_motions(lin: LinearModel, analysis: Observability) -> tuple[str, ...]:
     """Name the unobservable motions of an analysis that do not decay by themselves."""
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-    basis = found.basis * size[:, None]
+    basis = analysis.basis * size[:, None]
     # The motions span an invariant subspace: A basis = basis F.
     rate = size[:, None] * mechanics.rate_matrix(lin) / size
     F = np.linalg.pinv(basis) @ rate @ basis
     motions = lasting(F, lin.dt)
     if motions.shape[1] in (0, len(F)):
-        return found.unobservable
-    lasts, _ = echelon(found.basis @ motions, size)
+        return analysis.unobservable
+    lasts, _ = echelon(analysis.basis @ motions, size)
     return tuple(mechanics.combination(column, lin.state_names, size) for column in lasts.T)
 
 
@@ -360,13 +360,13 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     else:
         duration = positive("duration", duration, "s")
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
-    if not all(np.isfinite(W).all() for W in found):
+        matrices = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
+    if not all(np.isfinite(W).all() for W in matrices):
         raise InputError(
             f"duration is {duration:g} s, over which the state transition matrix overflows; give "
             "a shorter duration"
         )
-    reach, show = (0.5 * (W + W.T) for W in found)
+    reach, show = (0.5 * (W + W.T) for W in matrices)
     return Gramians(reach, show, np.inf if duration is None else duration)
 
 

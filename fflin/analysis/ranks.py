@@ -81,8 +81,12 @@ class Margin(NamedTuple):
         If the rank is decided the other way, the number of controllable or observable states
         changes by `change`.
         """
-        counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
-        left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
+        counted = [decision for decision in self.decisions if decision.ratio == self.kept < CLEAR][
+            :1
+        ]
+        left_out = [
+            decision for decision in self.decisions if decision.ratio == self.dropped > LOST
+        ][:1]
         return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
 
 
