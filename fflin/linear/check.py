@@ -107,8 +107,8 @@ class Check:
             verdict = f"{', '.join(names)} {verb} not verified: {count}"
         else:
             largest = max(self.rows, key=lambda row: row.error)
-            said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"{self._verified} are verified: largest error {said}"
+            error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
+            verdict = f"{self._verified} are verified: largest error {error_text}"
         table = [["compared with", "comparisons", "largest error", "of", "allowed"]]
         for test in dict.fromkeys(row.test for row in self.rows):
             rows = [row for row in self.rows if row.test == test]
@@ -179,8 +179,8 @@ def check_all(
         tolerance = share("tolerance", tolerance)
     largest: dict[tuple[str, str], Row] = {}
     for lin in models:
-        for found in _comparisons(robot, lin):
-            row = found if tolerance is None else found._replace(tolerance=tolerance)
+        for comparison in _comparisons(robot, lin):
+            row = comparison if tolerance is None else comparison._replace(tolerance=tolerance)
             before = largest.setdefault((row.test, row.block), row)
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 largest[row.test, row.block] = row
@@ -220,10 +220,10 @@ class References:
 
     def matrices(self) -> dict[str, Reference]:
         """Return A and B by ABA, and C and D if the output is not the state."""
-        found = {"A": self.route.A, "B": self.route.B}
+        references = {"A": self.route.A, "B": self.route.B}
         if self._outputs is not None:
-            found |= {"C": self._outputs.C, "D": self._outputs.D}
-        return found
+            references |= {"C": self._outputs.C, "D": self._outputs.D}
+        return references
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare a model that has this operating point."""

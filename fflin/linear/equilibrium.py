@@ -78,17 +78,17 @@ class Equilibrium(FrozenArrays):
     force_units: tuple[str, ...]
 
     def __str__(self) -> str:
-        said = "u: all zero"
+        text = "u: all zero"
         if self.u.any():
-            said = signals("u", self.u, self.input_names, self.input_units)
+            text = signals("u", self.u, self.input_names, self.input_units)
         if self.tilt.any():
             angles = np.degrees(self.tilt)
-            said += f"\n{signals('tilt of the base', angles, ('x', 'y', 'z'), ('deg',) * 3)}"
+            text += f"\n{signals('tilt of the base', angles, ('x', 'y', 'z'), ('deg',) * 3)}"
         if not (shown := np.where(np.abs(self.sag) > _ROUNDING, self.sag, 0.0)).any():
-            return said
+            return text
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('deflections', shown, names, units)}"
+        return f"{text}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
@@ -192,8 +192,8 @@ def equilibrium(
     tilt = truth("tilt", tilt)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     if robot.orbit:  # put the reference at the base, so that forces and inputs are in base axes
-        own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
-        linearizer = Linearizer(robot, frame=frame, reference=own)
+        base_pose = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
+        linearizer = Linearizer(robot, frame=frame, reference=base_pose)
     else:
         linearizer = Linearizer(robot, moving=True)
     balance = first = _settled(linearizer, state, given, v, spun=False)
@@ -275,8 +275,8 @@ def _settled(
             break
         lin, step = linearizer(balance.lin.q, v, balance.u), np.zeros(len(soft))
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
-        own = np.sqrt(robot.springs.stiffness[soft[6:]])
-        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
+        scale = np.sqrt(robot.springs.stiffness[soft[6:]])
+        if np.linalg.eigvals(hold / np.outer(scale, scale)).real.min() <= TOLERANCE:
             weak = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
             raise EquilibriumError(
                 f"the springs of {weak} are too weak to hold '{robot.name}' at this "
@@ -535,10 +535,10 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
         """Show a table with one row for each group of four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
-            said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
+            stability = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
             growth = float(one.poles.real.max()) if one.stable is False else 0.0
             sizes = [f"{moment:.5g}" for moment in one.moments]
-            rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
+            rows.append([*sizes, stability, f"{growth:.4g}" if growth else "."])
         return (
             f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
         )
@@ -619,14 +619,14 @@ def relative_equilibria(
             "axis"
         )
     n = mean_motion(robot)
-    found = []
+    equilibria = []
     field = OrbitField(robot, frame_of(robot, frame))
     rounding = _ROUNDING * (sizes[2] / sizes[0]) ** 2
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        own = axes[:, order] * signs
-        if np.linalg.det(own) < 0.0:
+        principal_axes = axes[:, order] * signs
+        if np.linalg.det(principal_axes) < 0.0:
             continue
-        R = field.axes @ own.T
+        R = field.axes @ principal_axes.T
         at = q.copy()
         moments = sizes[list(order)]
         at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
@@ -644,5 +644,5 @@ def relative_equilibria(
         poles = np.column_stack((roots, -roots)).ravel()
         margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
-        found.append(RelativeEquilibrium(at, moments, poles, stable, margin))
-    return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
+        equilibria.append(RelativeEquilibrium(at, moments, poles, stable, margin))
+    return RelativeEquilibria(sorted(equilibria, key=lambda one: (-one.margin, *one.moments)))

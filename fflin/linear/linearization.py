@@ -106,8 +106,11 @@ class Prepared:
         if not self.own_reference:
             self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
-        for signal, of in signals:
-            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
+        for signal, source in signals:
+            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = (
+                source.names,
+                source.units,
+            )
         A = np.zeros((nx, nx))
         A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))  # N (2.1)
         self.rest: dict[str, Array] = {
@@ -338,15 +341,15 @@ class Linearizer:
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
-                    here = _STANDING, rates, x0[k], point
-                    seen.append(output_equations(sensing, actuation, self._data, *here))
+                    measured_point = _STANDING, rates, x0[k], point
+                    seen.append(output_equations(sensing, actuation, self._data, *measured_point))
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
         f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0
         else:
-            C, D, y = (np.array([each[key] for each in seen]) for key in ("C", "D", "y0"))
+            C, D, y = (np.array([equations[key] for equations in seen]) for key in ("C", "D", "y0"))
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)
         return {"A": A, "B": B, "C": C, "D": D, "y": y}

@@ -478,22 +478,22 @@ def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
     kinds = ("states", "inputs", "outputs")
-    states, inputs, outputs = (_labels(*each) for each in zip(kinds, signals, strict=True))
+    states, inputs, outputs = (_labels(*group) for group in zip(kinds, signals, strict=True))
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 
 def _labels(kind: str, names: Sequence[str]) -> list[str]:
     """Return names for python-control, or raise `InputError` if two signals get the same name."""
-    found = dict[str, str]()
+    labels = dict[str, str]()
     for name in names:
         label = undotted(name)
-        if label in found:
+        if label in labels:
             raise InputError(
-                f"the {kind} '{found[label]}' and '{name}' both get the name '{label}' in "
+                f"the {kind} '{labels[label]}' and '{name}' both get the name '{label}' in "
                 "python-control, whose names contain no dots; rename one of them, such as its joint"
             )
-        found[label] = name
-    return list(found)
+        labels[label] = name
+    return list(labels)
 
 
 def refuse_sampled(dt: float, do: str) -> None:

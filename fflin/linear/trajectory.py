@@ -168,8 +168,8 @@ class Trajectory(Design):
 
     def _report(self) -> str:
         """Return text about the trajectory: its largest residual, or why it is invalid."""
-        said = self._fault or f"residual {self.residual.max():.1e}"
-        return folded([repr(self), said, *self._note.splitlines()])
+        verdict = self._fault or f"residual {self.residual.max():.1e}"
+        return folded([repr(self), verdict, *self._note.splitlines()])
 
     @cached_property
     def _aba(self) -> Aba:
@@ -206,8 +206,8 @@ class Trajectory(Design):
         knot, divided by the duration of the interval and by the largest rate of the motion. The
         residual of a knot is the larger error of its two adjacent intervals.
         """
-        found = self.interval_errors
-        larger: Array = np.maximum(np.append(found, 0.0), np.append(0.0, found))
+        errors = self.interval_errors
+        larger: Array = np.maximum(np.append(errors, 0.0), np.append(0.0, errors))
         return larger
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
@@ -414,14 +414,14 @@ class Trajectory(Design):
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
-        terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
+        terms = [state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)]
         # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
         push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
         rotors = state.robot.rotors
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         speed = np.abs(v).max(axis=0)
-        for group in ([0, 1, 2], [3, 4, 5], *([each] for each in alone), others):
+        for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
             for x in (speed, push):
                 x[group] = x[group].max(initial=0.0) or 1.0
 
@@ -430,7 +430,7 @@ class Trajectory(Design):
             jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
             return float(np.maximum(miss, jump).max())
 
-        found = []
+        errors = []
         steps = 1
         model = self.robot.model
         # If the knots are not a motion of the robot, the integration may overflow. The error of the
@@ -447,8 +447,8 @@ class Trajectory(Design):
                     change = size(apart, end[1] - before[1], h)
                     if change <= _ACCURACY or not np.isfinite(change):
                         break
-                found.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
-        return np.where(np.isfinite(found), found, np.inf)
+                errors.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
+        return np.where(np.isfinite(errors), errors, np.inf)
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
@@ -558,4 +558,4 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
     u = values["u"]
     u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
     smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
-    return min(held, smooth, key=lambda each: float(each.residual.max()))
+    return min(held, smooth, key=lambda trajectory: float(trajectory.residual.max()))
