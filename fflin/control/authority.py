@@ -164,7 +164,7 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
         return ThrusterAuthority(0)
     W = actuation.columns(robot.create_data(), q)[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
-    low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
+    low, high = (bound[thrusters] for bound in input_limits(robot, limits_of(robot)))
     every_way = gives_every_wrench(W, np.full(count, True))
     bounded = bool(np.isfinite(high).all())
     if not (every_way and bounded and count <= _MANY):
@@ -236,8 +236,8 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
         within = np.linalg.norm(normals / scale @ kept, axis=1)
         crossing = within > _ROUNDING * np.linalg.norm(normals / scale, axis=1)
         along = (normals / scale)[crossing] @ W
-        for each in (along, -along):
-            reach = np.maximum(each * low, each * high).sum(axis=1) / within[crossing]
+        for components in (along, -along):
+            reach = np.maximum(components * low, components * high).sum(axis=1) / within[crossing]
             least = min(least, float(reach.min(initial=math.inf)))
     return least
 

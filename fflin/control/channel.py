@@ -119,8 +119,8 @@ def warn_beyond(
         for k, ((name, unit), row) in enumerate(zip(units.items(), worst, strict=True))
         if exceeded[k]
     ]
-    said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
-    warnings.warn(said, FflinWarning, stacklevel=3)
+    message = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
+    warnings.warn(message, FflinWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +137,8 @@ class Law:
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
-        own = type(u) is np.ndarray and u.dtype is DOUBLE
-        u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        is_double = type(u) is np.ndarray and u.dtype is DOUBLE
+        u = np.array(u) if is_double else as_double(f"policy(t, q, v) at t = {t:g} s", u)
         names = self.names
         shape = (len(self.names),)
         if u.shape == shape and math.isfinite(u.dot(u)):

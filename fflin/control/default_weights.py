@@ -243,12 +243,12 @@ def _on_velocities(
     L = np.linalg.solve(lin.M, root)
     F, H = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L), np.linalg.solve(L, X[m:, m:] @ L)
     _, stiffness, modes = np.linalg.svd(F)
-    own = H.T @ H * damped
+    damping_term = H.T @ H * damped
     back = np.linalg.inv(L)
 
     def at(w: float) -> Array:
         part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
-        values, directions = np.linalg.eigh((modes.T * part) @ modes - own)
+        values, directions = np.linalg.eigh((modes.T * part) @ modes - damping_term)
         rows = directions.T @ back
         weight: Array = (rows.T * values.clip(0.0)) @ rows / w**4
         return 0.5 * (weight + weight.T)
@@ -326,11 +326,11 @@ def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: floa
         base.append(f"{size[groups.index('r_b')]:.2g} m")
     sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
     units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
-    largest = {unit: max(d for of, d, _ in sizes if of == unit) for unit in units}
+    largest = {unit: max(d for joint_unit, d, _ in sizes if joint_unit == unit) for unit in units}
     from_where = [f"{' and '.join(base)} of the base"] if base else []
     if largest:
-        each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
-        from_where.append(f"{each} of the joints")
+        offsets = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
+        from_where.append(f"{offsets} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
     slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
@@ -356,14 +356,14 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     return total
 
 
-def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
+def _limits_on(kind: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
     """Return, for each limited signal, the factor on the bandwidth at which it reaches its limit.
 
     `room` maps the name of each signal to its limit. With a factor of 1, the largest values of the
     signals are `used`. The values are proportional to the factor raised to the power `power`.
     """
     return [
-        Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
+        Limit((most / size) ** (1.0 / power), f"the {kind} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]
@@ -423,16 +423,16 @@ def _slowed(
         left, effort = min(efforts, default=Limit(1.0, ""))
         decay = -rates.real
         fast = np.abs(rates)
-        said = (
+        description = (
             f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
             f"1/s, damping ratio at least {(decay / fast).min():.2g}"
         )
         slow = decay < _AS_SLOW * math.sqrt(0.5) * w
         if names := _moving_most(lin, modes[:, slow]):
-            said += f"; modes decaying more slowly: {listed(names)}"
+            description += f"; modes decaying more slowly: {listed(names)}"
         if left >= 1.0 - 1e-6:
-            return limit, said
-        trials.append((left, effort, limit, said, np.abs(lin.u0) + use))
+            return limit, description
+        trials.append((left, effort, limit, description, np.abs(lin.u0) + use))
         if w <= least.bandwidth:
             break
         # Springs and gravity require efforts even if the loop is very slow, so the factor `left` is
@@ -441,15 +441,15 @@ def _slowed(
     if not trials:
         return limit, ""  # the later design of the regulator also fails, and reports the reason
     enough = _IN_VAIN * max(left for left, *_ in trials)
-    _, effort, (w, reason), said, required = next(x for x in trials if x[0] >= enough)
+    _, effort, (w, reason), description, required = next(x for x in trials if x[0] >= enough)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
     # True if an unstable mode or the sampling time determines the bandwidth, and not an effort.
     held = reason == least.what
-    what = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    return Limit(w, what), said
+    cause = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    return Limit(w, cause), description
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
@@ -461,7 +461,7 @@ def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
-    return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
+    return [name for name, moves in zip(lin.state_names[:m], among, strict=False) if moves]
 
 
 # Along a trajectory, the design displacements are multiplied by _BESIDE. They should decay within

@@ -172,7 +172,7 @@ class Gain(ModelDesign):
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
         head = f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
-        notes = [fold(f"{what}: {said}") for what, said in more.items() if said]
+        notes = [fold(f"{label}: {text}") for label, text in more.items() if text]
         return "\n\n".join(
             (
                 head,
@@ -298,12 +298,12 @@ def make_gain(
 
 def cautions(gain: Gain) -> list[str]:
     """Return warnings about a small disk margin at the inputs, and about negative thrust."""
-    said: list[str] = []
+    messages: list[str] = []
     if not _has_margin_of_kalman(gain) and (margins := gain.margins).disk < _FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
         if gain.dt:
             remedy = "shorten dt, or slow the loop as the default weights do"
-        said.append(
+        messages.append(
             f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
             f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
             f"unstable; {remedy}"
@@ -313,19 +313,19 @@ def cautions(gain: Gain) -> list[str]:
         name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
     if thrusters:
-        said.append(
+        messages.append(
             f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so "
             "the poles and margins do not hold; design with torque and force on the base, and "
             "allocate them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin "
             "simulate` do so by default if the thrusters can push in every direction"
         )
     if stopped := _stopped_rotors(gain):
-        said.append(
+        messages.append(
             f"the operating point moves {listed(stopped)}, which cannot spin forever, because it "
             "has position limits; the gain regulates its angle and so stops it; remove the limits "
             "(type continuous in the URDF) to fly it as a wheel"
         )
-    return said
+    return messages
 
 
 def _why_not_regulated(names: list[str]) -> str:
@@ -439,16 +439,16 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
     poles = np.linalg.eigvals(A)
     starts = sorted({0.0, *np.abs(poles).tolist()})
-    found = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, starts))
+    peak = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, starts))
     while True:
-        bound = found[0] * (1.0 + ACCURACY)
+        bound = peak[0] * (1.0 + ACCURACY)
         crossings, on_axis = gain_crossings(A, B, C, D, bound)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
         between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
-        best = max(map(gain, between.tolist()), default=found)
+        best = max(map(gain, between.tolist()), default=peak)
         if best[0] <= bound:
-            return max(found, best)
-        found = best
+            return max(peak, best)
+        peak = best
 
 
 def _largest_among(

@@ -237,7 +237,7 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     shooting = search.shooting
     bounds = search.bounds
     cost = search.cost
-    found = list[_Made]()
+    attempts = list[_Made]()
     unit = float((cost * guess[2] ** 2).sum() or cost.sum())
     cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
@@ -253,14 +253,14 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        found.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
-        if found[-1].reached and found[-1].most <= _BETWEEN:
+        attempts.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
+        if attempts[-1].reached and attempts[-1].most <= _BETWEEN:
             break
-    return max(found, key=lambda made: (made.reached, -made.most))
+    return max(attempts, key=lambda made: (made.reached, -made.most))
 
 
 def _require_within(
-    shooting: Shooting, bounds: Array, what: str, point: Point, asked: Mask
+    shooting: Shooting, bounds: Array, which_end: str, point: Point, asked: Mask
 ) -> None:
     """Raise `InputError` if a state of a point is outside its limits.
 
@@ -275,7 +275,7 @@ def _require_within(
         if asked[i] and side * (values[i] - limit) > _REACHED
     ]
     if outside:
-        raise InputError(f"the {what} is outside the limits: {listed(outside)}")
+        raise InputError(f"the {which_end} is outside the limits: {listed(outside)}")
 
 
 def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
@@ -283,7 +283,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     names = [f"the attitude about {axis}" for axis in "xyz"] + [*state.names[3:]]
-    by = [
+    misses = [
         f"{words} {names[i]} by {far[i]:.3g} {units[i]}"
         for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
         for i in np.argsort(-far)[:3]
@@ -301,7 +301,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
             "moves the base"
         )
     elif asked[state.groups.q_b].any() and all(
-        isinstance(each, JointTorque) for each in robot.inputs
+        isinstance(actuator, JointTorque) for actuator in robot.inputs
     ):
         advice = (
             "joint torques alone rotate the base only if the joints move in loops (the system is "
@@ -310,7 +310,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
         )
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
-        f"last trial {listed(by) if by else 'diverges'}; {advice}"
+        f"last trial {listed(misses) if misses else 'diverges'}; {advice}"
     )
 
 
@@ -352,11 +352,11 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
     names, units = state.names + input_keys(actuation), state.units + actuation.units
     bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
     shares = np.abs(values) / np.where(bound > 0.0, bound, np.inf)
-    found: dict[tuple[str, bool], tuple[float, str]] = {}
+    nearest: dict[tuple[str, bool], tuple[float, str]] = {}
     for i in np.flatnonzero(np.isfinite(limits).any(axis=0)):
         k = int(shares[:, i].argmax())
-        said = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
+        text = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
         group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
-        found[group] = max(found.get(group, (0.0, said)), (float(shares[k, i]), said))
-    said = ", ".join(said.replace(" ", "\u00a0") for _, said in found.values())
-    return f"\nnearest to their limits at the knots: {said}" if said else ""
+        nearest[group] = max(nearest.get(group, (0.0, text)), (float(shares[k, i]), text))
+    text = ", ".join(text.replace(" ", "\u00a0") for _, text in nearest.values())
+    return f"\nnearest to their limits at the knots: {text}" if text else ""

@@ -181,8 +181,10 @@ class TrajectoryFeedback(Feedback):
     @cached_property
     def end_gain(self) -> Array:
         """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
-        by = self.schedule
-        return steady_regulator(SteadyEnd(self.end, np.zeros(3)), by.Q, by.R, by.dt)[1]
+        schedule = self.schedule
+        return steady_regulator(
+            SteadyEnd(self.end, np.zeros(3)), schedule.Q, schedule.R, schedule.dt
+        )[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
         """Return q (nq,) and v (nv,) displaced from the initial state of the trajectory.
@@ -228,10 +230,10 @@ class TrajectoryFeedback(Feedback):
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
-        state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
+        state, design_state = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
         for kind in ("input", "state"):
-            require_same(made, state, kind, *signals_of(own, kind))
+            require_same(made, state, kind, *signals_of(design_state, kind))
         require_turns(made, origin.nq, robot)
         return state
 
@@ -347,17 +349,17 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         origin = self.trajectory.robot
         home = self.state_map(robot)
         made = f"the trajectory was made for '{origin.name}'"
-        own = signals_of(StateMap(origin, frame="local"), "output")
-        require_same(made, home, "output", *own)
+        design_outputs = signals_of(StateMap(origin, frame="local"), "output")
+        require_same(made, home, "output", *design_outputs)
 
-        def there(t: float) -> tuple[Measuring, Array]:
+        def expected_at(t: float) -> tuple[Measuring, Array]:
             q, v, _ = self.reference(t)
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
         dt = self.filter.dt
         sizes = self.filter.L.shape[1:]
-        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *there(t)), self.noise)
+        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise)
 
     @property
     def measurement_noise(self) -> Noise | None:

@@ -59,8 +59,8 @@ class SteadyEnd(NamedTuple):
             return lin
         back = 2.0 * np.eye(len(T)) - T  # the inverse, because (T - I)^2 = 0
         outputs = Linearizer(robot, moving=True)(lin.q, self.v, lin.u0)
-        own = {name: getattr(outputs, name) for name in ("C", "D", "y0")}
-        return replace(lin, A=back @ lin.A @ T, B=back @ lin.B, **own)
+        output_fields = {name: getattr(outputs, name) for name in ("C", "D", "y0")}
+        return replace(lin, A=back @ lin.A @ T, B=back @ lin.B, **output_fields)
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:

@@ -222,7 +222,8 @@ class Loops:
             return np.concatenate((self.error(joints), self.beyond(joints).max(axis=0).ravel()))
 
         ellipses = sorted(
-            self.ellipses(circles, postures), key=lambda each: float(np.linalg.norm(error(each)))
+            self.ellipses(circles, postures),
+            key=lambda candidate: float(np.linalg.norm(error(candidate))),
         )[:_IMPROVED]
         angle = float(np.linalg.norm(self.error(self.path)))
         size = float(np.linalg.norm(self.torques(basis, ellipses[0])))
@@ -234,7 +235,7 @@ class Loops:
             return np.concatenate((error(coefficients), torques.ravel()))
 
         for ellipse in ellipses:
-            found = least_squares(
+            solution = least_squares(
                 residuals, ellipse.ravel(), max_nfev=_EVALUATIONS, ftol=1e-4, xtol=1e-4
             )
-            yield found.x.reshape(4, -1)
+            yield solution.x.reshape(4, -1)

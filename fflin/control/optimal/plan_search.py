@@ -302,12 +302,12 @@ class Search(NamedTuple):
             step = again
         return best, most, exceeding
 
-    def _report(self, what: str, trial: Trial, limited: Mask) -> None:
+    def _report(self, phase: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
         cost = float((self.cost * trial.u**2).sum())
         inside = excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
-        self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
+        self.report(f"{phase}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
 
     def _trial(self, q: Array, v: Array, u: Array) -> Trial:
         shooting = self.shooting
@@ -374,10 +374,10 @@ class Search(NamedTuple):
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
-        found = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
-        if found is None:
+        solution = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
+        if solution is None:
             return None
-        z, du, gaps, multipliers = found
+        z, du, gaps, multipliers = solution
         moved = rows @ np.hstack((z, du)).ravel()
         outside = float(excess(room - moved).sum())
         forces = (rows.T @ multipliers).reshape(len(u), -1)
@@ -537,8 +537,8 @@ def solve_stages(
     )
     if solver.solve() != piqp.PIQP_SOLVED:
         return None
-    found = solver.result
-    w = (found.x[: len(size)] * size).reshape(knots, nw)
-    y = (unit * of_rows * found.y).reshape(knots, nx)[1:]
-    multipliers = unit * (found.z_u[m:] - found.z_l[:m]) if m else np.zeros(0)
+    result = solver.result
+    w = (result.x[: len(size)] * size).reshape(knots, nw)
+    y = (unit * of_rows * result.y).reshape(knots, nx)[1:]
+    multipliers = unit * (result.z_u[m:] - result.z_l[:m]) if m else np.zeros(0)
     return w[:, :nx], np.clip(w[:, nx:], *limits), y, multipliers

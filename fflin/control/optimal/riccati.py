@@ -181,16 +181,16 @@ def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
     """Return the solution of the half-size method, or None if it is not reliable."""
-    found = structured(Riccati(A, B, Q, R, N, dt))
-    return found if is_reliable(found, dt) else None
+    solution = structured(Riccati(A, B, Q, R, N, dt))
+    return solution if is_reliable(solution, dt) else None
 
 
-def is_reliable(found: Solution | None, dt: float) -> bool:
+def is_reliable(solution: Solution | None, dt: float) -> bool:
     """Return whether a solution is accurate and has no pole near the stability boundary."""
-    if found is None or not found.sound:
+    if solution is None or not solution.sound:
         return False
-    size = np.abs(found.poles - 1.0 if dt else found.poles).max()
-    return bool(found.margin >= _NEAR_BOUNDARY * size)
+    size = np.abs(solution.poles - 1.0 if dt else solution.poles).max()
+    return bool(solution.margin >= _NEAR_BOUNDARY * size)
 
 
 def best_solution(equation: Riccati, start: Solution | None) -> Solution:
@@ -201,19 +201,19 @@ def best_solution(equation: Riccati, start: Solution | None) -> Solution:
     """
     if start is not None and start.sound:
         return start
-    found = [] if start is None else [start]
+    solutions = [] if start is None else [start]
     for unit in (False, True):
         # SciPy raises one of these errors if it finds no finite solution, if R is singular, or if
         # it cannot reorder the eigenvalues of the pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
-                found.append(general)
+                solutions.append(general)
                 if general.sound:
                     break
-    if not found:
+    if not solutions:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
-    return min(found, key=lambda solution: solution.residual)
+    return min(solutions, key=lambda solution: solution.residual)
 
 
 def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
@@ -222,7 +222,7 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
     Newton's method starts from the loop of a modified Q: the rows and columns of the velocities are
     multiplied by 1 + `apart`.
     """
-    found = None
+    solution = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
         if source is None:
@@ -241,12 +241,12 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
         modes, cost = loop
         P = modes.lyapunov_modal(cost)
         refined = _refined(equation, P, None if equation.discrete else modes)
-        found = _finished(equation, *refined, "structured")
-    if apart or (found is not None and found.sound):
-        return found
+        solution = _finished(equation, *refined, "structured")
+    if apart or (solution is not None and solution.sound):
+        return solution
     # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
     # method then starts from the loop of a slightly different Q.
-    return structured(equation, _APART) or found
+    return structured(equation, _APART) or solution
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
@@ -275,7 +275,7 @@ def _finished(
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
     poles = modes.poles(F) if modes else np.linalg.eigvals(F)
-    found = solved(
+    solution = solved(
         trial.P,
         K,
         poles,
@@ -284,7 +284,7 @@ def _finished(
         rounding=trial.rounding,
         discrete=equation.discrete,
     )
-    return found if found.margin > 0.0 else None
+    return solution if solution.margin > 0.0 else None
 
 
 def _refined(
