@@ -47,10 +47,14 @@ class Aba:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
-        absolute = self.field.absolute(q, v) if self.field else v
+        absolute = v
+        if self.field:
+            absolute = self.field.absolute(q, v)
         wrenches = self._wrenches(q, absolute, u)
         rate = self._accelerate(self._model, q, absolute, forces, wrenches)
-        return self.field.relative(v, absolute, rate) if self.field else rate
+        if self.field:
+            return self.field.relative(v, absolute, rate)
+        return rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
         """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
@@ -141,8 +145,9 @@ class Aba:
         for joint, momentum in stored:
             torque = -np.cross(self._data.v[joint].angular, momentum)
             total[joint] += pin.Force(np.zeros(3), torque)
-        for joint, pull in enumerate(self.field.wrenches(self._data) if self.field else ()):
-            total[joint] += pull
+        if self.field:
+            for joint, pull in enumerate(self.field.wrenches(self._data)):
+                total[joint] += pull
         return total
 
     def _passive_force(self, q: Array, v: Array) -> Array:

@@ -355,13 +355,7 @@ def capture(
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
         other = replace(payload)  # a copy, since the payload may be the same object as the robot
-    for name in ("gravity", "orbit") if isinstance(payload, Robot) else ():
-        robot_value, payload_value = getattr(robot, name), getattr(other, name)
-        if robot_value != payload_value:
-            raise InputError(
-                f"the robot's {name} is {robot_value}, but the payload's is {payload_value}; give "
-                f"both the same {name}"
-            )
+        _require_same_environment(robot, other)
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload has a momentum but no inertia, so its momentum would be "
@@ -381,6 +375,17 @@ def capture(
     return Capture(**of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix)
 
 
+def _require_same_environment(robot: Robot, payload: Robot) -> None:
+    """Raise `InputError` if two robots differ in gravity or orbit."""
+    for name in ("gravity", "orbit"):
+        robot_value, payload_value = getattr(robot, name), getattr(payload, name)
+        if robot_value != payload_value:
+            raise InputError(
+                f"the robot's {name} is {robot_value}, but the payload's is {payload_value}; give "
+                f"both the same {name}"
+            )
+
+
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
     """Return the checked configuration and velocity of a payload, with its base placed at `at`.
 
@@ -394,6 +399,8 @@ def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tupl
         return configuration, np.zeros(other.nv)
     if other.n and dimension("payload_v", v) == 1 and len(v) == 6:
         v = np.concatenate((vector("payload_v", v, 6, "a twist"), np.zeros(other.nv - 6)))
-    expected = "the twist (linear, angular) of the payload" + ", and its joints" * bool(other.n)
+    expected = "the twist (linear, angular) of the payload"
+    if other.n:
+        expected += ", and its joints"
     v = vector("payload_v", v, other.nv, expected)
     return configuration, other.checked_velocity(v)

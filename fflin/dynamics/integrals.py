@@ -270,7 +270,8 @@ def _turned(axes: Axes, vector: Vector) -> Vector:
     for axis, entry in zip(axes, vector, strict=True):
         # Most frames are parallel to the frame of their parent, so most entries are zero.
         if isinstance(entry, np.ndarray) or entry:
-            total = _times(axis, entry) if total is _ZERO else _plus(total, _times(axis, entry))
+            part = _times(axis, entry)
+            total = part if total is _ZERO else _plus(total, part)
     return total
 
 

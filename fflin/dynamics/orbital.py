@@ -77,7 +77,10 @@ class OrbitField:
         exceed `_USELESS`.
         """
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
-        error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
+        radius = math.inf
+        if self.robot.orbit:
+            radius = self.robot.orbit.radius
+        error = 1.5 * distance / radius
         message = (
             f"'{self.robot.name}' extends to {distance / 1e3:.4g} km from the origin of its orbit "
             f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"
