@@ -252,7 +252,9 @@ def _in_motion(lin: LinearModel) -> Controllability:
     conserved = moving_points.conserved(lin)
     count = len(conserved.rows)
     notes = moving_points.steadiness(lin)
-    margin = None if count else moving_points.all_coordinates_driven(lin)
+    margin = None
+    if not count:
+        margin = moving_points.all_coordinates_driven(lin)
     if margin is not None:
         return _result(
             lin,
@@ -272,6 +274,7 @@ def _in_motion(lin: LinearModel) -> Controllability:
     zero = moving_points.constant_poles(count, lin.dt)
     fixed = fixed._replace(settling=ranks.Margin())  # the frozen poles do not decide about decay
     undecided = mechanics.undecided(lin, fixed, "controllable", inside.shape[1])
+    stabilizable = False if count else None
     return _result(
         lin,
         inside,
@@ -279,7 +282,7 @@ def _in_motion(lin: LinearModel) -> Controllability:
         uncontrollable=(*conserved.names, *names),
         rows=np.vstack((conserved.rows, rows)),
         fixed_poles=np.concatenate((zero, fixed.poles)),
-        stabilizable=False if count else None,
+        stabilizable=stabilizable,
         method=ranks.FROZEN,
         margin=fixed.margin,
         notes=(moving_points.NOTE, *notes, *undecided),
@@ -296,7 +299,11 @@ def _along(traj: LinearTrajectory) -> Controllability:
     lost = np.vstack((conserved.rows, rows))
     dimension = split.image.shape[1]
     fixed = ranks.FixedPoles(margin=split.margin)
-    stabilizable = None if len(lost) else True
+    stabilizable: bool | None = True
+    if len(lost):
+        stabilizable = None
+    if len(conserved.rows):
+        stabilizable = False
     return _result(
         last,
         split.to_x @ split.image,
@@ -305,7 +312,7 @@ def _along(traj: LinearTrajectory) -> Controllability:
         uncontrollable=(*conserved.names, *names),
         rows=lost,
         fixed_poles=np.zeros(0),
-        stabilizable=False if len(conserved.rows) else stabilizable,
+        stabilizable=stabilizable,
         method=ranks.GRAMIAN,
         margin=split.margin,
         notes=mechanics.undecided(last, fixed, "controllable", dimension),
@@ -507,7 +514,10 @@ def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
     for stem, names in groups.items():
         same = [name for name in everything if name.startswith(stem)]
         whole = len(names) > 1 and bool(stem) and len(same) == len(names)
-        patterns += [f"{stem}*"] if whole else names
+        if whole:
+            patterns.append(f"{stem}*")
+        else:
+            patterns += names
     return patterns
 
 
@@ -518,7 +528,9 @@ def require_detectable(lin: LinearModel) -> None:
         report = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
         return _conclude(DetectabilityError, *report)
     analysis = observability(lin)
-    words = "" if analysis.detectable else missed.format(listed(lasting_motions(lin, analysis)))
+    words = ""
+    if not analysis.detectable:
+        words = missed.format(listed(lasting_motions(lin, analysis)))
     return _conclude(DetectabilityError, words, analysis.notes, analysis.margin)
 
 
@@ -595,7 +607,8 @@ def _reached(
             candidates.append(complex(pole))
     missed, margin = list[Values](), ranks.Margin()
     for pole in candidates:
-        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
+        shift = pole if pole.imag else pole.real
+        shifted = A - shift * np.eye(len(A))
         matrix = np.column_stack((shifted, B))
         # Rows and columns have different units, so they are scaled to comparable sizes.
         rows = np.ones(len(matrix))
@@ -612,14 +625,18 @@ def _reached(
         rank = int((ratios > 1.0).sum())
         missed += list(vectors[rank:])
         margin &= ranks.judged(ratios, vectors.T, rank)
-    doubts = [
-        f"undecided: {_dominant(at[None], lin.state_names)} counts as "
-        f"{'' if change < 0 else 'not '}{what}, but the test value is only {ratio:.2g} times its "
-        "rounding error, so another machine may decide otherwise"
-        for ratio, at, change in margin.doubts
-    ]
-    name = _spanning if spans and len(missed) > 1 else _dominant
-    words = complaint.format(name(np.array(missed), lin.state_names)) if missed else ""
+    doubts = list[str]()
+    for ratio, at, change in margin.doubts:
+        decision = what if change < 0 else f"not {what}"
+        doubts.append(
+            f"undecided: {_dominant(at[None], lin.state_names)} counts as {decision}, but the test "
+            f"value is only {ratio:.2g} times its rounding error, so another machine may decide "
+            "otherwise"
+        )
+    words = ""
+    if missed:
+        name = _spanning if spans and len(missed) > 1 else _dominant
+        words = complaint.format(name(np.array(missed), lin.state_names))
     return words, doubts, margin
 
 
@@ -634,7 +651,9 @@ def _dominant(vectors: Values, names: Sequence[str]) -> str:
     count = len(vectors)
     if large.sum() <= count:
         return words
-    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"
+    if count == 1:
+        return f"a combination of {words}"
+    return f"{count} combinations of {words}"
 
 
 def _spanning(vectors: Values, names: Sequence[str]) -> str:

@@ -103,12 +103,16 @@ class Mode(FrozenArrays):
     @property
     def damping_ratio(self) -> float:
         """Damping ratio -Re(p)/abs(p): 0 if undamped, 1 if real and stable, < 0 if unstable."""
-        return 0.0 if self.pole.real == 0.0 else -self.pole.real / abs(self.pole)
+        if self.pole.real == 0.0:
+            return 0.0
+        return -self.pole.real / abs(self.pole)
 
     @property
     def time_constant(self) -> float:
         """Time [s] in which the mode decays, or grows if it is unstable, by a factor e."""
-        return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
+        if self.pole.real == 0.0:
+            return float("inf")
+        return 1.0 / abs(self.pole.real)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +201,9 @@ class Modes:
         """All nx eigenvalues of A [rad/s], including zero and conjugate eigenvalues."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
-            listed += [mode.pole, mode.pole.conjugate()] if mode.oscillates else [mode.pole]
+            listed.append(mode.pole)
+            if mode.oscillates:
+                listed.append(mode.pole.conjugate())
         return np.array(listed)
 
     def __str__(self) -> str:
@@ -209,7 +215,8 @@ class Modes:
             f"({counted(self.zero_eigenvalues, 'eigenvalue')} at zero), "
             f"{counted(vibrations, 'vibration')}"
         )
-        head += f", {counted(others, 'real pole')}" if others else ""
+        if others:
+            head += f", {counted(others, 'real pole')}"
         if not self.equilibrium:
             head += "; not an equilibrium: eigenvalues of a frozen model do not show stability"
         lines = [head]
@@ -220,10 +227,13 @@ class Modes:
         parts = [folded([line]) for line in lines]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         for mode in self.modes:
-            swing = f"{mode.frequency:.6g}", f"{mode.damping_ratio:.4g}"
+            frequency = damping = "."
+            if mode.oscillates:
+                frequency = f"{mode.frequency:.6g}"
+                damping = f"{mode.damping_ratio:.4g}"
             decay = f"{mode.time_constant:.4g}" if mode.pole.real else "."
-            growth = "unstable" * mode.unstable
-            rows.append([*(swing if mode.oscillates else ".."), decay, growth, ""])
+            growth = "unstable" if mode.unstable else ""
+            rows.append([frequency, damping, decay, growth, ""])
         left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
         for row, mode in zip(rows[1:], self.modes, strict=True):
             row[-1] = _percents(mode.energy, width() - left)
@@ -259,7 +269,8 @@ class Modes:
         of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]
         for name, parts in effective_shares(robot._bare.model, robot.appendages).items():
             cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
-            of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
+            frequency = f"{clamped[name]:.6g}" if name in clamped else "."
+            of_masses.append([name, frequency, *cells])
         title = (
             "effective masses and moments of inertia about the frame of the appendage, in % of "
             "the inertia of the body that carries it, or of the inertia in its file"
@@ -340,7 +351,8 @@ def modes(lin: LinearModel) -> Modes:
         if scaled_pole.imag < 0.0:
             continue
         oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
-        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
+        growth = 0.0 if oscillates else scaled_pole.real
+        pole = complex(growth, scaled_pole.imag) * fastest
         shape = vector / weight
         left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
@@ -381,8 +393,9 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
     text = ""
     for count in range(len(words), 0, -1):
         left = sum(list(energy.values())[count:])
-        others = f"; + {len(energy) - count} more {100.0 * left:.0f} %" if left >= 0.005 else ""
-        text = ", ".join(words[:count]) + others
+        text = ", ".join(words[:count])
+        if left >= 0.005:
+            text += f"; + {len(energy) - count} more {100.0 * left:.0f} %"
         if len(text) <= room:
             break
     return text
@@ -445,7 +458,8 @@ def _body_names(robot: Robot) -> list[str]:
     root_link = links.pop(ROOT, "base")
     joints = enumerate(list(robot.model.names)[ROOT + 1 :], ROOT + 1)
     names = [links.get(index, name) for index, name in joints]
-    return [root_link if "base" in names else "base", *names]
+    base = root_link if "base" in names else "base"
+    return [base, *names]
 
 
 def _energies(robot: Robot, q: Array, v: Array) -> Array:

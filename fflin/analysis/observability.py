@@ -74,7 +74,9 @@ class Observability(RankAnalysis):
     detectable: bool | None
 
     def __str__(self) -> str:
-        lines = [f"unobservable: {', '.join(self.unobservable)}"] if self.unobservable else []
+        lines = list[str]()
+        if self.unobservable:
+            lines.append(f"unobservable: {', '.join(self.unobservable)}")
         parts = ("position", "velocity", "attitude")[: (len(self.basis) - self.bound) // 3]
         limit = f"no output depends on the {listed(parts)} of the base"
         return self._summary("observable", limit, verdict(self.detectable, "detectable"), lines)
@@ -141,7 +143,8 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
         if hidden := unobservable(system, position, velocity, lin.dt):
             motions, _, fixed = hidden
             motions = np.vstack((N @ motions[:nv], motions[nv:]))
-            method = "eigenvalues" if system.acting else "closed form"
+            if not system.acting:
+                method = "closed form"
     if motions is None:
         # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
         X = mechanics.rate_matrix(lin)
@@ -188,6 +191,7 @@ def _in_motion(lin: LinearModel) -> Observability:
     motions = np.hstack((known, others))
     fixed = fixed._replace(settling=Margin())  # the frozen poles do not decide about decay
     undecided = mechanics.undecided(lin, fixed, "observable", nx - motions.shape[1])
+    detectable = False if known.shape[1] else None
     return _result(
         lin,
         motions,
@@ -195,7 +199,7 @@ def _in_motion(lin: LinearModel) -> Observability:
         fixed_poles=np.concatenate(
             (moving_points.constant_poles(known.shape[1], lin.dt), fixed.poles)
         ),
-        detectable=False if known.shape[1] else None,
+        detectable=detectable,
         method=FROZEN,
         margin=fixed.margin,
         notes=(moving_points.NOTE, *notes, *undecided),
@@ -211,14 +215,18 @@ def _along(traj: LinearTrajectory) -> Observability:
     nx = len(motions)
     dimension = nx - motions.shape[1]
     fixed = FixedPoles(margin=split.margin)
-    detectable = None if motions.shape[1] else True
+    detectable: bool | None = True
+    if motions.shape[1]:
+        detectable = None
+    if known.shape[1]:
+        detectable = False
     return _result(
         first,
         motions,
         bound=dimension,
         duration=float(traj.t[-1] - traj.t[0]),
         fixed_poles=np.zeros(0),
-        detectable=False if known.shape[1] else detectable,
+        detectable=detectable,
         method=GRAMIAN,
         margin=split.margin,
         notes=mechanics.undecided(first, fixed, "observable", dimension),
@@ -350,9 +358,14 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     if duration is None:
         poles = np.linalg.eigvals(lin.A)
         size = float(np.abs(poles).max())
-        growth = size - 1.0 if lin.dt else float(poles.real.max())
-        if growth >= -_DECAY * (1.0 if lin.dt else size):
-            slow = f"of modulus {size:.6g}" if lin.dt else f"at {growth:.3g} 1/s"
+        growth = float(poles.real.max())
+        allowed = -_DECAY * size
+        slow = f"at {growth:.3g} 1/s"
+        if lin.dt:
+            growth = size - 1.0
+            allowed = -_DECAY
+            slow = f"of modulus {size:.6g}"
+        if growth >= allowed:
             raise InputError(
                 f"the model is not asymptotically stable (a pole {slow}), so its infinite-time "
                 "Gramians are not finite; give duration= for finite-time Gramians"
@@ -367,7 +380,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
             "a shorter duration"
         )
     reach, show = (0.5 * (W + W.T) for W in matrices)
-    return Gramians(reach, show, np.inf if duration is None else duration)
+    span = np.inf if duration is None else duration
+    return Gramians(reach, show, span)
 
 
 def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
