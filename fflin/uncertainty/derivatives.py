@@ -17,7 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Standing
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Chart, Standing
 from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
@@ -80,7 +80,9 @@ class ModelDerivatives:
         data = robot.create_data()
         self._state = state
         self._data = robot.create_data()
-        self._chart = Standing() if default_reference else state.chart(lin.q)
+        self._chart: Chart = Standing()
+        if not default_reference:
+            self._chart = state.chart(lin.q)
         self._u, self._nu = actuation.in_base_axes(self._chart, lin.u0), state.velocities(lin.v)
         nv, nu = len(self._nu), len(self._u)
         self._inverse, slopes, by_u = (np.empty((nv, size)) for size in (nv, state.nx, nu))
@@ -91,8 +93,9 @@ class ModelDerivatives:
         # are set to zero; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
         self._q[:3] = self._v[:3] = 0.0
-        self._gradient = GravityGradient.at(state.field, lin.q) if state.field else None
-        if self._gradient:
+        self._gradient: GravityGradient | None = None
+        if state.field:
+            self._gradient = GravityGradient.at(state.field, lin.q)
             self._v[PIN_ANGULAR] += self._gradient.spin
         self._joints = range(ROOT, robot.model.njoints)
 
@@ -163,7 +166,9 @@ class ModelDerivatives:
 
         total = pin.computeTotalMass(self.robot.model)
         for row, one in enumerate(parameters):
-            step = 1.0 / (self.fraction(one.bodies) or 1.0) if one.bodies else 1.0
+            step = 1.0
+            if one.bodies:
+                step = 1.0 / (self.fraction(one.bodies) or 1.0)
             mass = sum(change[0] for change in one.bodies.values())
             values = [
                 weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)
@@ -188,7 +193,9 @@ class ModelDerivatives:
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
             route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
-            return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
+            if lin.dt:
+                return held_exponential(*route[:2], lin.dt)
+            return route[:2]
 
         (dA, dB, *_), worst = self.over([one]), 0.0
         values = zip(*map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True)

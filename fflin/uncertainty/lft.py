@@ -115,7 +115,8 @@ class LFT(Design):
         columns = self.parameters, self.units, self.middle, self.half, self.repeats
         for name, unit, middle, half, repeats in zip(*columns, strict=True):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
-            rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
+            shown_unit = "." if unit == "1" else unit
+            rows.append((name, shown_unit, *ends, f"{repeats:g}"))
         many = counted(len(self.repeats), "parameter")
         count = f"{self.repeats.sum():g}"
         title = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"

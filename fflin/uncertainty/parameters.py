@@ -77,7 +77,8 @@ class Parameters(dict[str, Parameter]):
             body = max(bodies, key=len)
             key = self._link_of[body] + key[len(body) :]
         names = [name for name in self if key == name or not self._of_several_links(name)]
-        names = names if stands_for_any(key, names) else list(self)
+        if not stands_for_any(key, names):
+            names = list(self)
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
@@ -111,13 +112,16 @@ class Parameters(dict[str, Parameter]):
         nominal = self._robot
         bodies = self._bodies(values)
         parts = self._by_owner(values)
-        robot = nominal.with_bodies(bodies) if bodies else nominal
+        robot = nominal
+        if bodies:
+            robot = nominal.with_bodies(bodies)
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
             changes, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
             if changes and joint.mode and stiffness:
                 omega, ratio = joint.oscillation(stiffness, nominal.damping.get(joint.name, 0.0))
-                omega = _TURN * changes["frequency"] if "frequency" in changes else omega
+                if "frequency" in changes:
+                    omega = _TURN * changes["frequency"]
                 damping = 2.0 * changes.get("damping", ratio) * joint.inertia * omega
                 changes = {"stiffness": joint.inertia * omega**2, "damping": damping}
             for part in springs.keys() & changes.keys():
@@ -134,7 +138,9 @@ class Parameters(dict[str, Parameter]):
                 inputs[index] = replace(item, position=position, torque=torque)
         fields = {**springs, "inputs": tuple(inputs)}
         changed = {key: value for key, value in fields.items() if value != getattr(robot, key)}
-        return robot.replace(**changed) if changed else robot
+        if not changed:
+            return robot
+        return robot.replace(**changed)
 
     def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Convert {parameter: value} to {owner: {part: value}}."""

@@ -244,7 +244,11 @@ class Sensitivity:
         rows = []
         for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
             small = one.part.partition(".")[0] in ("com", "position")
-            step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
+            step = 0.1 * abs(one.value)
+            if not one.value and one.part.startswith("direction"):
+                step = 0.1
+            if small:
+                step = 0.01
             effect = [
                 step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)
             ]
@@ -264,10 +268,10 @@ class Sensitivity:
             f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
         )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
-        more = f"... and {len(rows) - top} more, see --top"
-        return "\n".join(
-            [folded([title]), "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)]
-        )
+        lines = [folded([title]), "", grid([heads, *most], "ll")]
+        if len(rows) > top:
+            lines.append(f"... and {len(rows) - top} more, see --top")
+        return "\n".join(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.

@@ -325,7 +325,9 @@ def _safe(loops: Loops) -> float:
 
     rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
     largest = largest_bound(response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int))
-    return 1.0 / largest if largest else np.inf
+    if not largest:
+        return np.inf
+    return 1.0 / largest
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
@@ -381,7 +383,8 @@ def largest_bound(
         """
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
-        scalings = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
+        real_blocks = blocks if asked else blocks[:0]
+        scalings = [*known, *_scalings(middle, real_blocks)]
         values = [bound_of(Z, scaling) for scaling in scalings]
         least = min(bound_of(middle[None], scaling) for scaling in scalings)
         return min(values), scalings[int(np.argmin(values))], least
