@@ -101,7 +101,8 @@ class Check:
         if failures := self.failures:
             blocks = list(dict.fromkeys(row.block for row in failures))
             names = [self._failed(block) for block in blocks[:6]]
-            names += ["..."] * (len(blocks) > 6)
+            if len(blocks) > 6:
+                names.append("...")
             verb = "is" if len(blocks) == 1 else "are"
             count = f"{len(failures)} of {len(self.rows)} comparisons FAILED"
             verdict = f"{', '.join(names)} {verb} not verified: {count}"
@@ -180,14 +181,17 @@ def check_all(
     largest: dict[tuple[str, str], Row] = {}
     for lin in models:
         for comparison in _comparisons(robot, lin):
-            row = comparison if tolerance is None else comparison._replace(tolerance=tolerance)
+            row = comparison
+            if tolerance is not None:
+                row = comparison._replace(tolerance=tolerance)
             before = largest.setdefault((row.test, row.block), row)
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 largest[row.test, row.block] = row
         if not title:
             condition = scaled_condition(inertia_matrix(robot, lin))
             title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
-    title += "" if tolerance is None else f", each error at most {tolerance:.1e}"
+    if tolerance is not None:
+        title += f", each error at most {tolerance:.1e}"
     return Check(tuple(largest.values()), title)
 
 
@@ -261,8 +265,9 @@ class References:
     def _inertia(self, lin: LinearModel) -> Iterator[Row]:
         route, M = self.route, self.route.M
         # If the inputs are the default ones, the lower half of B is M^-1.
-        default = route.aba.actuation.default
-        inverse = lin.B[-len(M) :] if default else inverse_inertia(route.state, lin)
+        inverse = lin.B[-len(M) :]
+        if not route.aba.actuation.default:
+            inverse = inverse_inertia(route.state, lin)
         scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
         scaled = scale[:, None] * inverse * scale
         least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])

@@ -199,30 +199,12 @@ def equilibrium(
     balance = first = _settled(linearizer, state, given, v, spun=False)
     if tilt and first.asks_tilt:
         balance = _tilted(linearizer, state, first, v)
-    attempts = [(given, True)] * bool(first.lin.wheels)
-    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
-        centered = on_orbit(robot, given, state.frame)
-        attempts += [(centered, False), *[(centered, True)] * bool(first.lin.wheels)]
-    for at, spun in attempts:
-        if balance.holds:
-            break
-        balance = _settled(linearizer, state, at, v, spun=spun)
-    balance = balance if balance.holds else first
-    pushes = forces_of(robot)
+    balance = _with_other_points(linearizer, state, balance, given, v)
     if not balance.holds:
-        sizes, named = np.abs(balance.left), list(pushes.items())
-        forces = [
-            f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
-            for i in np.argsort(-sizes)  # the largest scaled force first
-            if sizes[i] > 1e-6 * sizes.max()
-        ]
-        advice = "add inputs that balance these forces (thrusters cannot pull)"
-        if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
-            advice += ", set gravity to zero if the robot falls freely"
-        raise EquilibriumError(
-            f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-            f"forces: {listed(forces)}; {advice}, or choose another point"
-        )
+        balance = first
+    if not balance.holds:
+        raise _unbalanced(robot, balance)
+    pushes = forces_of(robot)
     at = balance.lin.q
     u = balance.u
     actuation = Actuation(state)
@@ -231,8 +213,10 @@ def equilibrium(
         R = state.reference.rotation.T @ base.rotation
         for columns in actuation.held:
             u[columns] = R @ u[columns]
-    turned = pin.log3(pin.Quaternion(given[3:7]).matrix().T @ pin.Quaternion(at[3:7]).matrix())
-    rotation = turned if (at[3:7] != given[3:7]).any() else np.zeros(3)
+    rotation = np.zeros(3)
+    if (at[3:7] != given[3:7]).any():
+        before, after = pin.Quaternion(given[3:7]), pin.Quaternion(at[3:7])
+        rotation = pin.log3(before.matrix().T @ after.matrix())
     names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
     sag = state.joints_apart(given, at)
     return Equilibrium(at, u, sag, rotation, balance.residual, *names)
@@ -254,6 +238,44 @@ def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
     center = pin.centerOfMass(robot.model, robot.create_data(), q)
     placed[:3] -= root.rotation.T @ (center - (center @ along) * along)
     return placed
+
+
+def _with_other_points(
+    linearizer: Linearizer, state: StateMap, balance: _Balance, given: Array, v: Array | None
+) -> _Balance:
+    """Return `balance` if it holds, or a balance with accelerating wheels or on the orbit."""
+    robot = linearizer.robot
+    wheels = balance.lin.wheels
+    attempts = list[tuple[Array, bool]]()  # configuration, and whether the wheels may accelerate
+    if wheels:
+        attempts.append((given, True))
+    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
+        centered = on_orbit(robot, given, state.frame)
+        attempts.append((centered, False))
+        if wheels:
+            attempts.append((centered, True))
+    for at, spun in attempts:
+        if balance.holds:
+            break
+        balance = _settled(linearizer, state, at, v, spun=spun)
+    return balance
+
+
+def _unbalanced(robot: Robot, balance: _Balance) -> EquilibriumError:
+    """Return the error that lists the residual forces of a balance, the largest first."""
+    sizes, named = np.abs(balance.left), list(forces_of(robot).items())
+    forces = [
+        f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
+        for i in np.argsort(-sizes)  # the largest scaled force first
+        if sizes[i] > 1e-6 * sizes.max()
+    ]
+    advice = "add inputs that balance these forces (thrusters cannot pull)"
+    if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
+        advice += ", set gravity to zero if the robot falls freely"
+    return EquilibriumError(
+        f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
+        f"forces: {listed(forces)}; {advice}, or choose another point"
+    )
 
 
 def _settled(
@@ -337,13 +359,18 @@ class _Balance:
         # Compute bounds (6 + n,) of the rounding errors in the forces, because large terms may
         # cancel in the forces.
         state, springs = linearizer.prepared.map, robot.springs
-        absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
+        absolute = lin.v
+        if state.field:
+            absolute = state.field.absolute(lin.q, lin.v)
         speed = np.abs(state.velocities(absolute))
         rounding = max(speed[:3].max(), speed[6:].max(initial=0.0)) * (np.abs(M) @ speed)
         farthest = np.abs(state.joint_positions(lin.q)) + np.abs(springs.rest)
         rounding[6:] += springs.stiffness * farthest
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
-        wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
+        noise = terms
+        if robot.orbit:
+            noise = terms + rounding
+        wanted[np.abs(wanted) <= noise] = 0.0
         if spun:
             wheels = np.array([6 + robot.joint_names.index(name) for name in lin.wheels])
             others = _without_wheels(M, wheels)
@@ -467,7 +494,8 @@ def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Arra
         pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
         u = np.zeros(len(u))
         u[pushing] = _pseudo_solve(C[:, pushing], d)
-        u = bounded if (u[one_sided] < 0.0).any() else u
+        if (u[one_sided] < 0.0).any():
+            u = bounded
     return u, C @ u - d
 
 
@@ -536,9 +564,12 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
             stability = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
-            growth = float(one.poles.real.max()) if one.stable is False else 0.0
             sizes = [f"{moment:.5g}" for moment in one.moments]
-            rows.append([*sizes, stability, f"{growth:.4g}" if growth else "."])
+            rate = 0.0
+            if one.stable is False:
+                rate = float(one.poles.real.max())
+            growth = f"{rate:.4g}" if rate else "."
+            rows.append([*sizes, stability, growth])
         return (
             f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
         )
@@ -638,8 +669,11 @@ def relative_equilibria(
         # To avoid cancellation, compute the root `larger` of larger magnitude first. The
         # other root is c / larger.
         apart = np.sqrt(complex(b * b - 4.0 * c))
-        larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
-        squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
+        if b < 0.0:
+            apart = -apart
+        larger = -0.5 * (b + apart)
+        smaller = c / larger if larger else 0.0
+        squares = np.array([-pitch, larger, smaller], dtype=complex)
         roots = n * np.sqrt(squares)
         poles = np.column_stack((roots, -roots)).ravel()
         margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)

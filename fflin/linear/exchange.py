@@ -142,7 +142,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     A, B = transformed(source, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
     rate: Array = to.P @ rates
-    x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
+    position = np.zeros(len(v)) if kind.tangent else q
+    x0 = np.concatenate((position, v))
     fields: dict[str, Any] = {"C": np.eye(len(A)), "D": np.zeros(B.shape), "y0": x0}
     outputs = states
     if lin.output_names != lin.state_names:
@@ -155,7 +156,9 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
         A, B, rate = euler_step(A, B, rate, step, tool)
-    f0: Array = rate * (not lin.moving)
+    f0: Array = rate
+    if lin.moving:
+        f0 = 0.0 * rate
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
@@ -280,7 +283,8 @@ def from_tool(
         return lin
     _, source, to, rates = _jacobians_at(robot, lin, tool)
     ours = transformed(source, to, lin.A, lin.B)
-    ours = euler_step(*ours, to.P @ rates, step, tool)[:2] if step else ours
+    if step:
+        ours = euler_step(*ours, to.P @ rates, step, tool)[:2]
     changes = []
     for name, given, expected in zip("AB", (A, B), ours, strict=True):
         change = expected if given is None else shaped(name, given, expected.shape)

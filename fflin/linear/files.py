@@ -167,9 +167,10 @@ def foreign_table(path: Path) -> Path | None:
     exists.
     """
     info = _csv_path(path, "info")
-    is_model = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
+    if info.is_file() and b"\nurdf_sha256," in info.read_bytes():
+        return None
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
-    tables = [] if is_model else [_csv_path(path, key) for key in keys]
+    tables = [_csv_path(path, key) for key in keys]
     return next((table for table in tables if table.is_file() and table.stat().st_size), None)
 
 
@@ -219,9 +220,12 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
     with located(str(source)):
-        entries = _entries(entries, robot) if table else entries
-        hold = hold or (text(entries["hold"]) if "hold" in entries else None)
-        frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
+        if table:
+            entries = _entries(entries, robot)
+        if not hold:
+            hold = text(entries["hold"]) if "hold" in entries else None
+        if not frame:
+            frame = text(entries["frame"]) if "frame" in entries else "local"
         return arguments(entries, robot, hold, frame, verified)
 
 
@@ -245,7 +249,8 @@ def arguments(
     reference = pin.XYZQUATToSE3(np.concatenate((pose[:3], quaternion)))
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
-    u = u[:, None] if u.ndim == 1 else u
+    if u.ndim == 1:
+        u = u[:, None]
     if u.ndim != 2:
         raise InputError(f"u has shape {u.shape}, expected one row of inputs for each knot")
     names = actuation.names
@@ -254,8 +259,11 @@ def arguments(
         lacking, other = (
             [n for n in a if n not in b] for a, b in ((names, file_names), (file_names, names))
         )
-        details = f"; it lacks the inputs {listed(lacking)}" if lacking else ""
-        details += f"; it has the other inputs {listed(other)}" if other else ""
+        details = ""
+        if lacking:
+            details += f"; it lacks the inputs {listed(lacking)}"
+        if other:
+            details += f"; it has the other inputs {listed(other)}"
         raise InputError(
             f"the file has {u.shape[-1]} inputs, expected one for each input of the robot, in the "
             f"order {listed(names)}{details}; load the robot with the inputs of the trajectory "
@@ -311,7 +319,8 @@ def _entries(columns: Record, robot: Robot) -> Record:
     state = StateMap(robot)
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
-    rows = rows if any(rows.values()) else {"x": list(state.names)}
+    if not any(rows.values()):
+        rows = {"x": list(state.names)}
     rows["t"] = ["t"]
     known = [name for names in rows.values() for name in names]
     require_known("column", known, columns)

@@ -51,10 +51,14 @@ def held(lin: LinearModel) -> LinearModel:
     if len(source.A) != 2 * robot.nv:
         return lin
     frame = frame_of(robot, source.frame)
-    reference = source.reference if robot.orbit or source.x0[:6].any() else None
+    reference = None
+    if robot.orbit or source.x0[:6].any():
+        reference = source.reference
     balanced = equilibrium(robot, source.q, v=source.v, frame=frame, reference=reference)
     model = linearize(robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference)
-    return model.discretize(lin.dt) if lin.dt else model
+    if lin.dt:
+        return model.discretize(lin.dt)
+    return model
 
 
 def held_if_possible(lin: LinearModel) -> LinearModel:

@@ -94,7 +94,8 @@ class LinearTrajectory(Trajectory):
         k = range(len(self))[index]
         lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         matrices = {name: getattr(self, name)[k] for name in "ABCD"}
-        lin = lin.discretize(self.dt) if self.dt else lin
+        if self.dt:
+            lin = lin.discretize(self.dt)
         return replace(lin, **matrices, y0=self.y[k], verified=self.verified)
 
     def __iter__(self) -> Iterator[LinearModel]:
@@ -112,7 +113,8 @@ class LinearTrajectory(Trajectory):
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
         k, s = intervals_of(self.t, times)
-        s = s * (not self.dt)
+        if self.dt:
+            s = 0.0 * s
         inside, knot = (s > 0.0) & (s < 1.0), k + (s == 1.0)
         A, B = self.A[knot], self.B[knot]
         if inside.any():

@@ -64,7 +64,8 @@ class Prepared:
         self.moving = truth("moving", moving)
         if moving:
             refuse_orbit(robot, "models with moving=True")
-        frame = "local" if moving and frame is None else frame
+        if moving and frame is None:
+            frame = "local"
         self.map = state = StateMap(robot, reference=reference, frame=frame)
         if moving and (reference is not None or state.frame != "local"):
             raise InputError(
@@ -123,15 +124,20 @@ class Prepared:
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
-        chart = _STANDING if self.own_reference else state.chart(q)
-        r_b = chart.q_b if self.own_reference else state.positions(q)
+        chart: Chart = _STANDING
+        r_b = chart.q_b
+        if not self.own_reference:
+            chart = state.chart(q)
+            r_b = state.positions(q)
         return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
     """Return the default reference: the base placement (7,) at the point of a model."""
     root, q = robot.model.jointPlacements[ROOT], lin.q[:7]
-    return q if root.isIdentity(0.0) else frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
+    if root.isIdentity(0.0):
+        return q
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
 
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
@@ -140,9 +146,14 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # position and the attitude of the base. For other robots, the position is ignorable, because
     # gravity is zero or uniform. If gravity is zero, the attitude relative to a moving reference
     # (`lin.moving`) is also ignorable.
-    groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
+    groups = list[str]()
+    if lin.moving and not any(robot.gravity):
+        groups.append("q_b")
+    groups.append("r_b")
+    if robot.orbit:
+        groups = []
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
-    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
+    return (*base, *(f"q_m.{name}" for name in robot.rotors))
 
 
 def wheels_of(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
@@ -308,14 +319,17 @@ class Linearizer:
         rates = self._accelerations.rates(q, v, nu, u_base, A[lower], B[lower])
         seen: dict[str, Array] = {}
         if ready.sensing is not None:
-            r_b = chart.q_b if ready.own_reference else state.positions(q)
+            r_b = chart.q_b
+            if not ready.own_reference:
+                r_b = state.positions(q)
             x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
             point = q, v, nu, u_base
             seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
             _require_finite(*seen.values())
         rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         _require_finite(A, B, rate)
-        rate = drift(state, rate, rates.gravity) if ready.moving else rate
+        if ready.moving:
+            rate = drift(state, rate, rates.gravity)
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)

@@ -139,7 +139,8 @@ class OutputReference:
         # that the joint moves is measured.
         per_unit = np.zeros(by_x.shape)
         per_unit[:, groups.q_b] = 2.0
-        per_unit[:, groups.r_b] = 1.0 / reach if reach else 0.0
+        if reach:
+            per_unit[:, groups.r_b] = 1.0 / reach
         per_joint = [body.scale for body in state.robot.joints]
         per_unit[:, groups.q_m] = _moved_by(state, len(h)) * per_joint
         by_column = np.repeat(sizes, nv, axis=1)

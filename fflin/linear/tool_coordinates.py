@@ -129,8 +129,13 @@ class ToolCoordinates:
             return q, v
         attitude, R = self._attitude(q)
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
-        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # R by columns
-        pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
+        if stored == "wxyz":
+            attitude = np.roll(attitude, 1)
+        elif stored == "euler":
+            attitude = _angles(R)
+        else:
+            attitude = R.T.ravel()  # R by columns
+        pose = np.concatenate((attitude, at.translation))
         turned = self._rotated(R, rates=self.convention.rates)
         twist = turned @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
@@ -180,8 +185,10 @@ class ToolCoordinates:
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
-            quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
-            quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
+            if quaternion[3] < 0.0:
+                quaternion *= -1.0
+            if self._moving:
+                quaternion = np.array((0.0, 0.0, 0.0, 1.0))
         return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
@@ -301,12 +308,15 @@ def _joint_path(robot: Robot, name: str) -> list[int]:
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
         name, at = frames[at].name, frames[at].parentFrame
-        path.insert(0, order.index(name) if name in order else len(order))
+        index = order.index(name) if name in order else len(order)
+        path.insert(0, index)
     return path
 
 
 def _left(P: Array) -> Array:
-    return np.asarray(np.linalg.inv(P) if len(P) == len(P.T) else np.linalg.solve(P.T @ P, P.T))
+    if len(P) == len(P.T):
+        return np.asarray(np.linalg.inv(P))
+    return np.asarray(np.linalg.solve(P.T @ P, P.T))
 
 
 def _angles(R: Array) -> Array:

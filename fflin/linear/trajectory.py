@@ -145,7 +145,8 @@ class Trajectory(Design):
         v, u = as_double("v", self.v), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
-        u = np.vstack((u, u[-1:])) if short else u
+        if short:
+            u = np.vstack((u, u[-1:]))
         for name, rows, size, more in (("v", v, robot.nv, ""), ("u", u, nu, hint)):
             if rows.shape != (count, size):
                 raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
@@ -155,7 +156,8 @@ class Trajectory(Design):
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
         values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
-        values["hold"] = self.hold or ("previous" if short else "linear")
+        default_hold = "previous" if short else "linear"
+        values["hold"] = self.hold or default_hold
         for name, value in values.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -195,7 +197,9 @@ class Trajectory(Design):
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         charts = self._aba.state.charts
-        return self.actuation.in_base_axes(charts(q), u) if self.actuation.held else u
+        if not self.actuation.held:
+            return u
+        return self.actuation.in_base_axes(charts(q), u)
 
     @property
     def residual(self) -> Array:
@@ -238,7 +242,9 @@ class Trajectory(Design):
         The time is given by `fraction`, the elapsed fraction of each interval, from 0 to 1.
         """
         u: Array = self.u[k]
-        return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
+        if self.hold == "previous":
+            return u
+        return u + fraction * (self.u[k + 1] - u)
 
     def accelerations(self) -> Array:
         """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
@@ -497,8 +503,9 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     if rows.shape == (count, robot.nq):
         return rows
     if rows.shape != narrow:
-        hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
-        hint = hint if len(cosines) else ""
+        hint = ""
+        if len(cosines):
+            hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
         raise InputError(f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}")
     wide = np.empty((count, robot.nq))
     wide[:, np.delete(np.arange(robot.nq), cosines + 1)] = rows
