@@ -146,9 +146,12 @@ def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
             add_joint(name, inertia)
     directions = np.array(axes).reshape(-1, 3)
     most = np.array(largest)
-    rank = int(np.linalg.matrix_rank(directions, tol=1e-6)) if axes else 0
-    bounded = rank == 3 and np.isfinite(most).all()
-    least = least_reach(directions.T, -most, most, np.eye(3)) if bounded else None
+    rank = 0
+    if axes:
+        rank = int(np.linalg.matrix_rank(directions, tol=1e-6))
+    least = None
+    if rank == 3 and np.isfinite(most).all():
+        least = least_reach(directions.T, -most, most, np.eye(3))
     return WheelMomentum(len(axes), np.array(stored) @ directions, rank, least)
 
 

@@ -104,7 +104,8 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
     pace = pace._replace(bandwidth=max(pace.bandwidth, _OF_FALL * _rate_of_fall(lin)))
     damping = _damping(lin)
     w = pace.bandwidth
-    for _ in range(_PASSES if damping.any() else 1):
+    passes = _PASSES if damping.any() else 1
+    for _ in range(passes):
         before = w
         M = lin.M + damping / w
         Q, R, rule, w, terms = _of_inertia(lin, M, np.linalg.inv(N), pace, momenta)
@@ -190,9 +191,9 @@ def _of_inertia(
     if loaded:
         least = min(Limit(_LEAST_OF_GROWTH * growth, mode), limit)
         limit, achieved = _slowed(lin, costs, size, size * ~idle, limit, least)
-    rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
-        "; joint damping is included" if damped else ""
-    )
+    rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION)
+    if damped:
+        rule += "; joint damping is included"
     terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
 
@@ -310,7 +311,8 @@ def _fastest(
     # M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
+    power = 1 if (mass == 1.0).all() else 2
+    first = 0.1 / rates[-1] ** power
     time = np.geomspace(first, 3.0, 60)[:, None]
     fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
     moving = (rates**2 * (slow - fast) / root).real
@@ -321,18 +323,24 @@ def _fastest(
 
 def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
-    base = [f"{turn:g} deg"] * ("q_b" in groups)
+    base = list[str]()
+    if "q_b" in groups:
+        base.append(f"{turn:g} deg")
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
     sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
     units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
     largest = {unit: max(d for joint_unit, d, _ in sizes if joint_unit == unit) for unit in units}
-    from_where = [f"{' and '.join(base)} of the base"] if base else []
+    from_where = list[str]()
+    if base:
+        from_where.append(f"{' and '.join(base)} of the base")
     if largest:
         offsets = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
         from_where.append(f"{offsets} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
-    slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
+    slow = ""
+    if limit.what:
+        slow = f"; bandwidth limited by {limit.what}"
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += (
             f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
@@ -446,9 +454,10 @@ def _slowed(
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
-    # True if an unstable mode or the sampling time determines the bandwidth, and not an effort.
-    held = reason == least.what
-    cause = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
+    cause = f"{effort}, which {_NOT_ENOUGH}"
+    if reason == least.what:
+        # An unstable mode or the sampling time determines the bandwidth, and not an effort.
+        cause = f"{reason}; {effort} {_NOT_ENOUGH}"
     return Limit(w, cause), description
 
 

@@ -158,8 +158,11 @@ class Gain(ModelDesign):
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
         left = [name for name in self.state_names if self.regulated and name not in self.regulated]
+        not_regulated = ""
+        if left:
+            not_regulated = f"{listed(left)} ({_why_not_regulated(left)})"
         more = {
-            "not regulated": f"{listed(left)} ({_why_not_regulated(left)})" if left else "",
+            "not regulated": not_regulated,
             "held at the operating point": "; ".join(self._held()),
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
@@ -188,8 +191,10 @@ class Gain(ModelDesign):
         if not self.u0.any():
             return []
         inputs = signals("u0", self.u0, self.input_names, self.input_units)
-        gained = () if self._lin is None else wheel_notes(self._lin)
-        return [" ".join(inputs.split()), *gained]
+        notes = [" ".join(inputs.split())]
+        if self._lin is not None:
+            notes += wheel_notes(self._lin)
+        return notes
 
     @property
     def closed_loop(self) -> Array:
@@ -246,7 +251,9 @@ class Gain(ModelDesign):
             D = D - H @ inverse @ G
             F, G, H = inverse @ (F - unit), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
         disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
-        most = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf
+        most = math.inf
+        if disk < 2.0:
+            most = (2.0 + disk) / (2.0 - disk)
         phase = math.degrees(2.0 * math.atan(disk / 2.0))
         return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
 
@@ -385,11 +392,14 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     """
     poles = design.poles[design.poles.imag >= 0.0]
     rates = rates_of(poles, design.dt)
-    heads = ["pole" if design.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
+    pole_title = "pole" if design.dt else "pole [1/s]"
+    heads = [pole_title, "frequency [rad/s]", "damping", "times"]
     rows = Counter[tuple[str, ...]]()
     for k in np.argsort(-rates.real):
         pole, rate = poles[k], rates[k]
-        shown = f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
+        shown = f"{pole.real:.5g}"
+        if pole.imag:
+            shown += f" +- {pole.imag:.5g}i"
         rows[shown, f"{abs(rate):.4g}", f"{-rate.real / abs(rate):.4g}"] += 1
     table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
     if max(rows.values()) == 1:
@@ -456,7 +466,9 @@ def _largest_among(
 ) -> tuple[float, float]:
     """Return a large gain at one of the ascending frequencies: the largest, if they are few."""
     count = len(frequencies)
-    step = 1 if count <= _MANY else -(-count // _FEW)
+    step = 1
+    if count > _MANY:
+        step = -(-count // _FEW)
     gains = {index: gain(frequencies[index]) for index in range(0, count, step)}
     # Between the frequencies that were tried, search near the best of them.
     while step > 1:

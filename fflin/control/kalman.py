@@ -198,7 +198,9 @@ class Compensator(ModelDesign):
 
 
 def _time(dt: float) -> str:
-    return f"sampled at {dt:g} s" if dt else "continuous"
+    if dt:
+        return f"sampled at {dt:g} s"
+    return "continuous"
 
 
 def kalman(
@@ -508,10 +510,14 @@ def disturbance(
     nx = len(model.state_names)
     if G is None:
         return weight("W", W, model.state_names), np.eye(nx)
-    knots = model.A.shape[:1] if dimension("G", G) == model.A.ndim == 3 else ()
+    knots: tuple[int, ...] = ()
+    hint = ": one column for each disturbance"
+    if dimension("G", G) == model.A.ndim == 3:
+        knots = model.A.shape[:1]
+        hint = ": one matrix for each knot, with one column for each disturbance"
     shape = *knots, nx, max((1, *np.shape(G))[-1], 1)
-    hint = f": {'one matrix for each knot, with ' if knots else ''}one column for each disturbance"
     through = shaped("G", G, shape, hint)
-    same = np.array_equal(through, model.B)
-    names = input_keys(model) if same else [f"w_{i + 1}" for i in range(through.shape[-1])]
+    names = tuple(f"w_{i + 1}" for i in range(through.shape[-1]))
+    if np.array_equal(through, model.B):
+        names = input_keys(model)
     return weight("W", W, names), through

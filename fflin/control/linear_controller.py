@@ -150,14 +150,18 @@ class LinearController(Feedback):
                 f"{listed(compress(lin.output_names, felt))}, because D of both is nonzero "
                 "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
-        dt = lin.dt if controller.dt is None or (controller.dt <= 0.0 and not nz) else controller.dt
+        dt = controller.dt
+        if dt is None or (dt <= 0.0 and not nz):
+            dt = lin.dt
         # A negative dt stands for an unknown sample time. The dt of a sampled model replaces it.
-        dt = lin.dt or dt if dt < 0.0 else dt
+        if dt < 0.0 and lin.dt:
+            dt = lin.dt
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
+            shown = "unknown" if dt < 0.0 else f"{dt:g} s"
             raise InputError(
-                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
-                f"model has dt = {lin.dt:g} s (0: continuous); give a controller with the dt of "
-                "the model, or give the continuous model"
+                f"the controller has dt = {shown}, but the model has dt = {lin.dt:g} s (0: "
+                "continuous); give a controller with the dt of the model, or give the continuous "
+                "model"
             )
         self.system = System(controller.A, B, C, D, dt, lin.output_names, lin.input_names)
         self.dt: float = dt
@@ -277,7 +281,9 @@ class LinearController(Feedback):
     @cached_property
     def loop(self) -> Array:
         """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
-        lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
+        lin = self.lin
+        if self.dt and not lin.dt:
+            lin = lin.discretize(self.dt)
         return self.loop_with(lin)
 
     def loop_with(self, lin: LinearModel) -> Array:
@@ -367,7 +373,8 @@ def _system_of(given: Any) -> System:
     dt = getattr(given, "dt", None)
     # Continuous systems of SciPy have dt = None and no signal names. In systems of other tools,
     # dt = None means that the sample time is not given.
-    dt = 0.0 if dt is None and not inputs else dt
+    if dt is None and not inputs:
+        dt = 0.0
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
@@ -383,11 +390,13 @@ def _checked(*given: Any) -> System:
         for key, matrix, default in zip("ABCD", matrices, defaults, strict=True)
     )
     nz = len(A) if A.size else 0
-    ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
-    if not nz:
+    if nz:
+        ny, nu = B.shape[-1], len(C)
+        if D.size == 1 and not D.any():
+            D = np.zeros((nu, ny))
+    else:
+        ny, nu = D.shape[-1], len(D)
         A, B, C = np.zeros((0, 0)), np.zeros((0, ny)), np.zeros((nu, 0))
-    elif D.size == 1 and not D.any():
-        D = np.zeros((nu, ny))
     hint = f", for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
     shapes = (nz, nz), (nz, ny), (nu, nz), (nu, ny)
     for key, matrix, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
@@ -406,7 +415,8 @@ def _read(path: Path) -> System:
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
         dt = entries.get("dt", entries.get("Ts"))
-        dt = None if dt is None else float(np.asarray(dt).item())
+        if dt is not None:
+            dt = float(np.asarray(dt).item())
         inputs = texts(entries.get("input_names", entries.get("InputName", ())))
         outputs = texts(entries.get("output_names", entries.get("OutputName", ())))
     A, B, C, D = (entries.get(key) for key in "ABCD")
@@ -453,7 +463,8 @@ def _index(kind: str, name: str, counterpart: str, known: Sequence[str]) -> int:
     """Return the index of a controller's signal among the names `known` of the model."""
     # Names in python-control cannot contain dots, so underscores may replace the dots.
     fits = [candidate for candidate in known if undotted(candidate) == undotted(name)]
-    fits = [name] if name in fits else fits
+    if name in fits:
+        fits = [name]
     if not fits:
         text = unknown(f"{counterpart} of the model", name, known)
         raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")

@@ -151,10 +151,13 @@ def mpc(
     samples = whole("horizon", horizon, 1)
     if sample is not None and dt is not None:
         raise InputError("sample and dt are both given, but dt is the former name of sample")
-    sample = dt if sample is None else sample
-    if sample is None and not lin.dt:
-        raise InputError("sample is missing; give the sampling time [s]")
-    dt = number("sample", lin.dt if sample is None else sample)
+    if sample is None:
+        sample = dt
+    if sample is None:
+        if not lin.dt:
+            raise InputError("sample is missing; give the sampling time [s]")
+        sample = lin.dt
+    dt = number("sample", sample)
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError(
@@ -234,7 +237,8 @@ def _unplanned(
     model: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
 ) -> Horizon:
     """Return a horizon with the limits of a model's signals, but no stages."""
-    if (robot := model.robot if isinstance(model, LinearTrajectory) else model._robot) is None:
+    robot = model.robot if isinstance(model, LinearTrajectory) else model._robot
+    if robot is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
     inputs, states, outputs = model.input_names, model.state_names, model.output_names
     beside = [name for name in outputs if name not in states]
@@ -252,7 +256,8 @@ def _unplanned(
             limit_of |= {beside[i]: limit for i, limit in ranges.items()}
             parts[k] = {key: limit for key, limit in part.items() if key not in output_keys}
     end = model.v[-1] if isinstance(model, LinearTrajectory) else model.v
-    acting = chosen_limits(robot, parts[0] if len(parts) == 1 else parts, robot.wheels_at(end))
+    given = parts[0] if len(parts) == 1 else parts
+    acting = chosen_limits(robot, given, robot.wheels_at(end))
     limit_of |= {name: acting[name] for name in states if name in acting}
     of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
@@ -386,11 +391,16 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
-    states, efforts, limited = [e], [], []
+    states = [e]
+    efforts, limited = list[Array](), list[Array]()
     for k, stage in enumerate(stages):
         selector = np.eye(nu, size + nx, k * nu)
-        d = stage.L @ selector - stage.K @ e if planned else selector
-        efforts.append(selector if planned else np.linalg.solve(stage.L, selector + stage.K @ e))
+        if planned:
+            d = stage.L @ selector - stage.K @ e
+            efforts.append(selector)
+        else:
+            d = selector
+            efforts.append(np.linalg.solve(stage.L, selector + stage.K @ e))
         e = stage.A @ e + stage.B @ d
         states.append(e)
         limited.append(stage.E @ e + stage.D @ d)
@@ -468,13 +478,16 @@ class Receding(BoundLaw):
             f"{self.solves}"
         )
         for event, (count, _, worst) in self._violations.items():
-            message += f"; {event} a soft limit: {count} (worst: {worst})" if count else ""
+            if count:
+                message += f"; {event} a soft limit: {count} (worst: {worst})"
         if self.unfinished:
             message += (
                 "; plans without a solution, replaced by the saturated LQR command: "
                 f"{self.unfinished}"
             )
-        return (message,) if self.solves else ()
+        if not self.solves:
+            return ()
+        return (message,)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
@@ -556,7 +569,9 @@ class Receding(BoundLaw):
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit
         width = width[np.isfinite(width)]
-        self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
+        self._size = 1.0
+        if len(width):
+            self._size = float(np.median(width)) or 1.0
         self._rows = self._G * self._unit[:, None]
 
     def _start(self) -> None:

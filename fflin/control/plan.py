@@ -184,13 +184,8 @@ def plan(
     _require_within(shooting, bounds, "goal", end, asked)
     # NumPy's warnings are not needed, because an error is raised if the search diverges.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
-        # Weights of the knots in the integral of the effort: the hold times if the inputs are held,
-        # otherwise the weights of the trapezoidal rule.
-        h = shooting.h
         inputs = np.array((low, high))
-        held = np.append(h, h[-1] if shooting.held else 0.0)
-        held = held if shooting.held else 0.5 * (held + held[::-1])
-        cost = held[:, None] * weights
+        cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
@@ -226,6 +221,19 @@ class _Made(NamedTuple):
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
 
 
+def _knot_weights(shooting: Shooting) -> Array:
+    """Return the weight [s] of each knot in the integral of the effort over time.
+
+    If the inputs are held, the weights are the hold times, otherwise those of the trapezoidal rule.
+    """
+    h = shooting.h
+    if shooting.held:
+        return np.append(h, h[-1])
+    padded = np.append(h, 0.0)
+    weights: Array = 0.5 * (padded + padded[::-1])
+    return weights
+
+
 def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
@@ -242,7 +250,10 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
     # more than the tolerance, a second attempt has limits at the knots only.
-    for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
+    divisions = [1]
+    if np.isfinite(bounds).any():
+        divisions = [_PARTS, 1]
+    for parts in divisions:
         (q, v, u, *_), optimality = search._replace(cost=cost, parts=parts).best(*guess)
         if optimality is not None:
             optimality = replace(optimality, effort=unit * optimality.effort)
@@ -308,9 +319,10 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
             "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
             "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
+    outcome = listed(misses) if misses else "diverges"
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
-        f"last trial {listed(misses) if misses else 'diverges'}; {advice}"
+        f"last trial {outcome}; {advice}"
     )
 
 
@@ -359,4 +371,6 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
         group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
         nearest[group] = max(nearest.get(group, (0.0, text)), (float(shares[k, i]), text))
     text = ", ".join(text.replace(" ", "\u00a0") for _, text in nearest.values())
-    return f"\nnearest to their limits at the knots: {text}" if text else ""
+    if not text:
+        return ""
+    return f"\nnearest to their limits at the knots: {text}"

@@ -299,14 +299,18 @@ def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None 
         legend_title = "margins at each input: phase, gain factors"
         letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
         figure.legend(lines, names, title=legend_title, loc="outside right upper", fontsize=letters)
-        # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
-        rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
+        rates, title, time = gain.poles, "poles of A - B K", ""
+        if gain.dt:
+            # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
+            rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt
+            title = "poles of A - B K as ln(z)/dt"
+            time = f", sampled at {gain.dt:g} s"
         _pole_map(poles, {"": rates}, 0.0)
-        poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
+        poles.set_title(title)
         low, high = gain.margins.gain
         figure.suptitle(
-            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: open loop at each "
-            "input, with the loops of all other inputs closed\nmargins for simultaneous "
+            f"{gain.robot}{time}: open loop at each input, with the loops of all other inputs "
+            "closed\nmargins for simultaneous "
             f"changes: phase {gain.margins.phase:.3g} deg, gain {low:.2g} to {high:.3g} (disk "
             f"margin {gain.margins.disk:.3g})",
             x=0.02,
@@ -331,8 +335,11 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         with np.errstate(divide="ignore", invalid="ignore"):
             return T / (1.0 - T)
 
-    rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt if dt else gain.poles)
-    end = math.pi / dt if dt else 100.0 * float(rates.max())
+    rates = np.abs(gain.poles)
+    end = 100.0 * float(rates.max())
+    if dt:
+        rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt)
+        end = math.pi / dt
     grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
 
@@ -353,7 +360,9 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     loops = []
     # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real. Its
     # phase may be -180 deg there, without a change of sign of the imaginary part.
-    ends = [response(0.0)] + [values[-1]] * bool(dt)
+    ends = [response(0.0)]
+    if dt:
+        ends.append(values[-1])
     for i in range(len(K)):
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
         turned = changes(np.imag, i, values[:, i].real < 0.0)

@@ -329,10 +329,11 @@ class AllocatedPolicy(BoundLaw):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on a run: how the commands are realised, and the notes of the inner policy."""
-        asked, given = (", ".join(actuation.groups) for actuation in (self._design, self._robot))
-        message = f"allocation: the commanded {asked} are realised by {given}"
         notes = self._inner.notes if self._inner else ()
-        return notes if self._design.names == self._robot.names else (message, *notes)
+        if self._design.names == self._robot.names:
+            return notes
+        asked, given = (", ".join(actuation.groups) for actuation in (self._design, self._robot))
+        return (f"allocation: the commanded {asked} are realised by {given}", *notes)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
@@ -437,8 +438,9 @@ class Loop(BoundLaw):
         self.stages = 0
         self._last = -np.inf
         self._at_rest: Array = np.zeros(state.robot.nv)
-        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba = Aba(state) if felt else None
+        self._aba: Aba | None = None
+        if any(output.FEELS_ACCELERATION for output in state.robot.outputs):
+            self._aba = Aba(state)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or at a stage of the integrator."""

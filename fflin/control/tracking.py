@@ -156,8 +156,9 @@ class TrajectoryFeedback(Feedback):
     @property
     def over(self) -> float:
         """Time [s] after which the command holds the robot at the end of the trajectory."""
-        held = self.held or self.schedule.dt
-        return self.duration * (2.0 - AT_THE_END if held else AT_THE_END)
+        if self.held or self.schedule.dt:
+            return self.duration * (2.0 - AT_THE_END)
+        return self.duration * AT_THE_END
 
     @property
     def jumps(self) -> bool:
@@ -167,7 +168,9 @@ class TrajectoryFeedback(Feedback):
     @property
     def ahead(self) -> float:
         """Time [s] after a sample at which the reference input equals its mean over the sample."""
-        return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
+        if self.trajectory.hold == "linear":
+            return 0.5 * self.schedule.dt
+        return 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, u of the trajectory point to which the command at run time t refers."""
@@ -217,7 +220,9 @@ class TrajectoryFeedback(Feedback):
             )
         if angles.any():
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
-            e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
+            if turn[3] < 0.0:
+                turn = -turn
+            e[:3] = turn[:3]
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:

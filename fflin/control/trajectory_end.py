@@ -71,7 +71,9 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
     rest relative to axes that fall with its centre of mass.
     """
     lin = traj[end]
-    return SteadyEnd(lin, np.zeros(3)) if lin.is_equilibrium() else rest_or_fall(traj, end)
+    if lin.is_equilibrium():
+        return SteadyEnd(lin, np.zeros(3))
+    return rest_or_fall(traj, end)
 
 
 def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
@@ -81,7 +83,9 @@ def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
     except EquilibriumError as error:
         if _falls(traj, end):
             return _falling_end(traj, end)
-        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
+        where, given = "start", "P0"
+        if end:
+            where, given = "end", "Q, R and Qf"
         raise EquilibriumError(
             f"no inputs hold the robot at the {where} of the trajectory: {error}; give {given}"
         ) from None

@@ -279,7 +279,8 @@ def rule_weights(
     # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
     # the robot names a rule, the rule is "urdf".
     source = lin.generator or lin
-    given = given if isinstance(given, Mapping) else {"rule": given}
+    if not isinstance(given, Mapping):
+        given = {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
     robot_weights = lin.weights if given.get("rule") is None else {}
     name = robot_weights.get("rule", given.get("rule"))
@@ -299,7 +300,9 @@ def rule_weights(
         # change the gain of the rule. With this factor, the geometric mean of the costs of the same
         # signals is 1 at the largest values of the rule.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
-        scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+        scale = 1.0
+        if costs:
+            scale = math.exp(-np.log(costs).mean())
         Q, R = scale * Q, scale * R
         for index, (value, *_) in weights.items():
             matrix, at = (Q, index) if index < len(Q) else (R, index - len(Q))
@@ -308,7 +311,8 @@ def rule_weights(
             matrix[at, at] = value
         named = dict.fromkeys(key for _, key, _ in weights.values())
         rule = f"{', '.join(named)} as given; all other weights: {rule}"
-        rule += " (these figures are for this rule alone)" if terms.any() else ""
+        if terms.any():
+            rule += " (these figures are for this rule alone)"
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
@@ -334,7 +338,9 @@ def _of_regulated(
     """
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
-    body = lin if part is lin else regulated_part(without(lin, wheels))
+    body = lin
+    if part is not lin:
+        body = regulated_part(without(lin, wheels))
     at = _limited_wheels(lin, wheels)
     names = [lin.state_names[i + len(lin.M)] for i in at]
     spin = np.abs(lin.x0[at + len(lin.M)])
@@ -384,7 +390,10 @@ def _weights_of(
             largest = part == "bryson"
             if largest and key.startswith("q_b"):
                 require_chart(label, value)
-            values[key] = inverse_square(label, value) if largest else value, key, largest
+            cost = value
+            if largest:
+                cost = inverse_square(label, value)
+            values[key] = cost, key, largest
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}
         if both := given_weights.keys() & at.keys():

@@ -105,7 +105,9 @@ def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point)
             row[:] = vector(
                 label, value, robot.n, "joint positions in the order of robot.joint_names"
             )
-    base = FloatingBase(shooting.state, start) if conserves_momentum(robot) else None
+    base = None
+    if conserves_momentum(robot):
+        base = FloatingBase(shooting.state, start)
     return _along(shooting, base, times, joints, start, end)
 
 

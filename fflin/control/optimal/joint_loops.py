@@ -178,7 +178,10 @@ class Loops:
             # The path is on the ellipse. Select the point of the ellipse that is farthest away from
             # the posture, or try several points if the posture is the path itself.
             toward = np.arctan2(posture @ b, posture @ a)
-            for phase in [toward] if posture.any() else np.arange(8) * np.pi / 4.0:
+            phases = np.arange(8) * np.pi / 4.0
+            if posture.any():
+                phases = np.array([toward])
+            for phase in phases:
                 first = np.cos(phase) * a + np.sin(phase) * b
                 second = np.cos(phase) * b - np.sin(phase) * a
                 # The loop first (1 - cos) + second sin is oriented from `second` to `first`.

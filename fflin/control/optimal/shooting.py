@@ -156,7 +156,8 @@ class Shooting:
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
         late = np.arange(2 * steps + 1) / (2.0 * steps)
-        late = np.zeros_like(late) if self.held else late
+        if self.held:
+            late = np.zeros_like(late)
         q, v = (motion[:, ::2] for motion in motions)
         inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
         points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
