@@ -153,9 +153,7 @@ def plan(
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    ends = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
-    x, q, v = (None, *ends) if isinstance(ends, tuple) and len(ends) == 2 else (ends, None, None)
-    end = points.point_of(state, x, q, v, lambda: (robot.neutral(), np.zeros(robot.nv)))
+    end = _goal_point(state, goal)
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)
     if not 1e-9 < duration < 1e9:
         raise InputError(f"duration is {duration:g} s, expected a positive time")
@@ -219,6 +217,22 @@ class _Made(NamedTuple):
     def reached(self) -> bool:
         """Whether the motion ends at the goal and is within the limits at the knots."""
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
+
+
+def _goal_point(
+    state: StateMap, goal: LinearModel | tuple[ArrayLike | None, ArrayLike | None] | ArrayLike
+) -> Point:
+    """Return q (nq,) and v (nv,) of a goal: the point of a model, (q, v), or a state x (nx,)."""
+    robot = state.robot
+
+    def at_rest() -> Point:
+        return robot.neutral(), np.zeros(robot.nv)
+
+    if isinstance(goal, LinearModel):
+        return points.point_of(state, None, goal.q, goal.v, at_rest)
+    if isinstance(goal, tuple) and len(goal) == 2:
+        return points.point_of(state, None, *goal, at_rest)
+    return points.point_of(state, goal, None, None, at_rest)
 
 
 def _knot_weights(shooting: Shooting) -> Array:
