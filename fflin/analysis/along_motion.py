@@ -125,7 +125,9 @@ def _split(traj: LinearTrajectory, F: Array, known: Array, to_x: Array, from_x: 
     nv = len(F) // 2
     size = float(np.linalg.norm(F, 2)) if F.size else 0.0
     units = known / np.linalg.norm(known, axis=0)
-    basis = np.linalg.qr(units, mode="complete")[0] if known.size else np.eye(len(F))
+    basis = np.eye(len(F))
+    if known.size:
+        basis = np.linalg.qr(units, mode="complete")[0]
     taken, others = np.split(basis, [known.shape[1]], axis=1)
     left, values, _ = np.linalg.svd(others.T @ F)
     values = np.pad(values, (0, len(left) - len(values)))

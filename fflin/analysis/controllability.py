@@ -101,7 +101,7 @@ class Controllability(ranks.RankAnalysis):
         if self.uncontrollable:
             lines.append(f"controllable: {', '.join(self.controllable)}")
             lines.append(f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}")
-            placed = [f"{what} {count}" for what, count in self.reach.items()]
+            placed = [f"{group} {count}" for group, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")
         conserved = self.uncontrollable[: len(self.basis) - self.bound]
         limit = f"no input can change {listed(mechanics.grouped(conserved))}"
@@ -200,13 +200,13 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     if not lin.is_equilibrium():
         return _in_motion(lin)
     conserved, size = mechanics.conserved(lin), np.tile(np.sqrt(lin.M.diagonal()), 2)
-    found = _by_second_order(lin, conserved)
-    if found is None:
+    split = _by_second_order(lin, conserved)
+    if split is None:
         z, R = conserved.selected, conserved.rates
         X, M = mechanics.rate_matrix(lin)[z] @ conserved.T, R.T @ lin.M @ R
         inside, _, rows, fixed = split_by_poles(X, lin.B[z], M, lin.dt)
-        found = inside, rows, None, "eigenvalues", fixed
-    controllable, rows, names, method, fixed = found
+        split = inside, rows, None, "eigenvalues", fixed
+    controllable, rows, names, method, fixed = split
     if names is None:
         z = conserved.selected
         rows, names = _named(rows, tuple(lin.state_names[i] for i in z), size[z])
@@ -252,7 +252,9 @@ def _in_motion(lin: LinearModel) -> Controllability:
     conserved = moving_points.conserved(lin)
     count = len(conserved.rows)
     notes = moving_points.steadiness(lin)
-    margin = None if count else moving_points.all_coordinates_driven(lin)
+    margin = None
+    if not count:
+        margin = moving_points.all_coordinates_driven(lin)
     if margin is not None:
         return _result(
             lin,
@@ -272,6 +274,7 @@ def _in_motion(lin: LinearModel) -> Controllability:
     zero = moving_points.constant_poles(count, lin.dt)
     fixed = fixed._replace(settling=ranks.Margin())  # the frozen poles do not decide about decay
     undecided = mechanics.undecided(lin, fixed, "controllable", inside.shape[1])
+    stabilizable = False if count else None
     return _result(
         lin,
         inside,
@@ -279,7 +282,7 @@ def _in_motion(lin: LinearModel) -> Controllability:
         uncontrollable=(*conserved.names, *names),
         rows=np.vstack((conserved.rows, rows)),
         fixed_poles=np.concatenate((zero, fixed.poles)),
-        stabilizable=False if count else None,
+        stabilizable=stabilizable,
         method=ranks.FROZEN,
         margin=fixed.margin,
         notes=(moving_points.NOTE, *notes, *undecided),
@@ -296,7 +299,11 @@ def _along(traj: LinearTrajectory) -> Controllability:
     lost = np.vstack((conserved.rows, rows))
     dimension = split.image.shape[1]
     fixed = ranks.FixedPoles(margin=split.margin)
-    stabilizable = None if len(lost) else True
+    stabilizable: bool | None = True
+    if len(lost):
+        stabilizable = None
+    if len(conserved.rows):
+        stabilizable = False
     return _result(
         last,
         split.to_x @ split.image,
@@ -305,7 +312,7 @@ def _along(traj: LinearTrajectory) -> Controllability:
         uncontrollable=(*conserved.names, *names),
         rows=lost,
         fixed_poles=np.zeros(0),
-        stabilizable=False if len(conserved.rows) else stabilizable,
+        stabilizable=stabilizable,
         method=ranks.GRAMIAN,
         margin=split.margin,
         notes=mechanics.undecided(last, fixed, "controllable", dimension),
@@ -393,14 +400,14 @@ def _by_second_order(
         everything = np.eye(2 * r)
         return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
     S = system.S.T
-    found = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
-    if found is None:
+    hidden = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
+    if hidden is None:
         return None
     # M, K and D are symmetric, because `unobservable` returns None otherwise. So the system with
     # the output S^T s is the dual of the system with the input matrix S. For each motion (s, v)
     # that this output does not observe, the row (s^T D + v^T M, s^T M) is an uncontrollable
     # combination of states.
-    motions, shapes, fixed = found
+    motions, shapes, fixed = hidden
     s, v = np.split(motions, 2)
     rows = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     # The controllable subspace is orthogonal to these rows.
@@ -426,10 +433,10 @@ def _by_second_order(
         zero = np.zeros_like(momenta)
         read += [np.hstack((momenta @ to_s, zero)), np.hstack((zero, momenta))]
         kind = "vibration" if pole.imag else "instability"
-        for what in ("", "rate of "):
-            for each in of_pole.real.T * system.size:
-                shape = combination(each / np.abs(each).max(), members, np.ones(r))
-                names.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
+        for prefix in ("", "rate of "):
+            for amplitudes in of_pole.real.T * system.size:
+                shape = combination(amplitudes / np.abs(amplitudes).max(), members, np.ones(r))
+                names.append(f"{prefix}{kind} at {abs(pole):.4g} rad/s ({shape})")
     return controllable, np.vstack(read), names, "modes", fixed
 
 
@@ -440,30 +447,30 @@ def require_stabilizable(lin: LinearModel) -> None:
         robot = lin._robot
         if robot and any(robot.damping.get(name) for name in lin.wheels):
             missed += ", or remove the damping of the wheels"
-        said = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
-        return _conclude(StabilizabilityError, *said)
-    found = controllability(lin)
+        report = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
+        return _conclude(StabilizabilityError, *report)
+    analysis = controllability(lin)
     words = ""
-    if not found.stabilizable:
+    if not analysis.stabilizable:
         # The message names the momenta and the other uncontrollable states that do not decay. It
         # omits the coordinates whose rates are the momenta.
         conserved = mechanics.conserved(lin)
         count = len(conserved.weights)
-        others = _lasting(lin, found, 2 * count)
-        lost = (*found.uncontrollable[:count], *others)
+        others = _lasting(lin, analysis, 2 * count)
+        lost = (*analysis.uncontrollable[:count], *others)
         words = missed.format(listed(mechanics.grouped(lost))) + _remedies(lin, conserved)
-    return _conclude(StabilizabilityError, words, found.notes, found.margin)
+    return _conclude(StabilizabilityError, words, analysis.notes, analysis.margin)
 
 
-def _lasting(lin: LinearModel, found: Controllability, first: int) -> tuple[str, ...]:
+def _lasting(lin: LinearModel, analysis: Controllability, first: int) -> tuple[str, ...]:
     """Name the uncontrollable combinations of states that do not decay by themselves.
 
-    The combinations are the rows of the result `found` from the row `first` on. The rows before it
-    are conserved.
+    The combinations are the rows of the result `analysis` from the row `first` on. The rows before
+    it are conserved.
     """
-    rows = found.rows
-    names = found.uncontrollable[first:]
-    if found.method == "modes" or not names:
+    rows = analysis.rows
+    names = analysis.uncontrollable[first:]
+    if analysis.method == "modes" or not names:
         return names  # undamped vibrations and instabilities
     # The combinations z = rows x obey dz/dt = F z, because they span a left invariant subspace.
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
@@ -507,7 +514,10 @@ def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
     for stem, names in groups.items():
         same = [name for name in everything if name.startswith(stem)]
         whole = len(names) > 1 and bool(stem) and len(same) == len(names)
-        patterns += [f"{stem}*"] if whole else names
+        if whole:
+            patterns.append(f"{stem}*")
+        else:
+            patterns += names
     return patterns
 
 
@@ -515,11 +525,13 @@ def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        said = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
-        return _conclude(DetectabilityError, *said)
-    found = observability(lin)
-    words = "" if found.detectable else missed.format(listed(lasting_motions(lin, found)))
-    return _conclude(DetectabilityError, words, found.notes, found.margin)
+        report = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
+        return _conclude(DetectabilityError, *report)
+    analysis = observability(lin)
+    words = ""
+    if not analysis.detectable:
+        words = missed.format(listed(lasting_motions(lin, analysis)))
+    return _conclude(DetectabilityError, words, analysis.notes, analysis.margin)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
@@ -595,7 +607,8 @@ def _reached(
             candidates.append(complex(pole))
     missed, margin = list[Values](), ranks.Margin()
     for pole in candidates:
-        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
+        shift = pole if pole.imag else pole.real
+        shifted = A - shift * np.eye(len(A))
         matrix = np.column_stack((shifted, B))
         # Rows and columns have different units, so they are scaled to comparable sizes.
         rows = np.ones(len(matrix))
@@ -612,14 +625,18 @@ def _reached(
         rank = int((ratios > 1.0).sum())
         missed += list(vectors[rank:])
         margin &= ranks.judged(ratios, vectors.T, rank)
-    doubts = [
-        f"undecided: {_dominant(at[None], lin.state_names)} counts as "
-        f"{'' if change < 0 else 'not '}{what}, but the test value is only {ratio:.2g} times its "
-        "rounding error, so another machine may decide otherwise"
-        for ratio, at, change in margin.doubts
-    ]
-    name = _spanning if spans and len(missed) > 1 else _dominant
-    words = complaint.format(name(np.array(missed), lin.state_names)) if missed else ""
+    doubts = list[str]()
+    for ratio, at, change in margin.doubts:
+        decision = what if change < 0 else f"not {what}"
+        doubts.append(
+            f"undecided: {_dominant(at[None], lin.state_names)} counts as {decision}, but the test "
+            f"value is only {ratio:.2g} times its rounding error, so another machine may decide "
+            "otherwise"
+        )
+    words = ""
+    if missed:
+        name = _spanning if spans and len(missed) > 1 else _dominant
+        words = complaint.format(name(np.array(missed), lin.state_names))
     return words, doubts, margin
 
 
@@ -634,7 +651,9 @@ def _dominant(vectors: Values, names: Sequence[str]) -> str:
     count = len(vectors)
     if large.sum() <= count:
         return words
-    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"
+    if count == 1:
+        return f"a combination of {words}"
+    return f"{count} combinations of {words}"
 
 
 def _spanning(vectors: Values, names: Sequence[str]) -> str:

@@ -80,7 +80,9 @@ class EffectiveMasses(FrozenArrays):
         )
         parts = [folded([head])]
         for values, unit, at in ((self.masses, "kg", 0), (self.inertias, "kg m^2", 3)):
-            others = {"free joints": self.free} if self.free.any() else {}
+            others = dict[str, Array]()
+            if self.free.any():
+                others["free joints"] = self.free
             others |= {"residual": self.residual, "total": self.total}
             total = self.total.diagonal()[at : at + 3]
             titles = [title for axis in "xyz" for title in (f"{axis} [{unit}]", "%")]
@@ -212,6 +214,8 @@ def _cells(values: Array, total: Array) -> list[str]:
     """Format each value and its percentage of the total, or two dots for a rounding error."""
     cells = []
     for value, whole in zip(values.tolist(), total.tolist(), strict=True):
-        seen = abs(value) > 1e2 * _ROUNDING * whole
-        cells += [f"{value:.4g}", f"{100.0 * value / whole:.1f}"] if seen else [".", "."]
+        if abs(value) > 1e2 * _ROUNDING * whole:
+            cells += [f"{value:.4g}", f"{100.0 * value / whole:.1f}"]
+        else:
+            cells += [".", "."]
     return cells

@@ -83,7 +83,9 @@ def split_by_poles(
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
     # If no force depends on the state, the unit of time is arbitrary.
-    unit = 1.0 / rate if rate > 0.0 else 1.0
+    unit = 1.0
+    if rate > 0.0:
+        unit = 1.0 / rate
     if dt:
         # If the sample time is the period of the only vibration, the state returns to its initial
         # value in each sample. X then contains rounding errors instead of the spring forces, and
@@ -101,17 +103,19 @@ def split_by_poles(
     # Orthogonal transformations split off left null vectors until none remain. For a defective
     # eigenvalue, the repeated steps split off the whole Jordan chain. A staircase algorithm is not
     # used, because it would carry the rounding error of an ill-conditioned step into the next step.
-    A, to = (A.T, to_x.T) if dual else (A, from_x)
+    to, back = from_x, to_x
+    if dual:
+        A, to, back = A.T, to_x.T, from_x.T
     B = ranks.unit_columns(to @ drive)
     inside, margin = np.eye(2 * nv), ranks.Margin()
     if known is not None and len(known):
-        taken = known @ (from_x.T if dual else to_x)
+        taken = known @ back
         taken /= np.linalg.norm(taken, axis=1, keepdims=True)
         inside = np.linalg.qr(taken.T, mode="complete")[0][:, len(known) :]
     rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
-        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
-        margin &= found.transformed(inside)
+        lost, step_margin = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
+        margin &= step_margin.transformed(inside)
         if not lost.shape[1]:
             break
         rest = np.hstack((rest, inside @ lost))
@@ -120,19 +124,31 @@ def split_by_poles(
     fixed = ranks.FixedPoles(margin=margin)
     if rest.shape[1]:
         rates, vectors = np.linalg.eig(rest.T @ A @ rest)
-        shapes = to_x @ rest @ vectors
-        poles = 1.0 + dt * rates / unit if dt else rates / unit
-        decay = 1.0 - np.abs(poles) if dt else -rates.real
-        least, most = int(decay.argmin()), int(decay.argmax())
-        slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
-        if dt and abs(poles[most]) < _DEAD:
-            # The motion `shapes[:, most]` decays to rounding error within one sample. The samples
-            # cannot distinguish two such motions, so the rank is undecided.
-            dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
-            margin &= dead.transformed(1.0, halved=True)
-        settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
-        fixed = ranks.FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
+        fixed = _fixed_poles(rates, unit, to_x @ rest @ vectors, dt, margin)
     return to_x @ inside, to_x @ rest, rest.T @ from_x, fixed
+
+
+def _fixed_poles(
+    rates: Values, unit: float, shapes: Values, dt: float, margin: ranks.Margin
+) -> ranks.FixedPoles:
+    """Return the poles ``rates / unit`` with the shapes (nx, k), and whether they decay.
+
+    If dt is not 0, `rates` belong to (A - I)/dt, and the returned poles belong to A.
+    """
+    poles = rates / unit
+    decay = -rates.real
+    if dt:
+        poles = 1.0 + dt * rates / unit
+        decay = 1.0 - np.abs(poles)
+    least, most = int(decay.argmin()), int(decay.argmax())
+    slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
+    if dt and abs(poles[most]) < _DEAD:
+        # The motion `shapes[:, most]` decays to rounding error within one sample. The samples
+        # cannot distinguish two such motions, so the rank is undecided.
+        dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
+        margin &= dead.transformed(1.0, halved=True)
+    settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
+    return ranks.FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:
@@ -149,7 +165,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
     # Rounding splits a defective zero eigenvalue into several poles, so zero itself is tested
     # first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
-    found: Array = np.zeros((len(A), 0))
+    basis: Array = np.zeros((len(A), 0))
     margin, known = ranks.Margin(), np.zeros(0, dtype=complex)
     for start in candidates:
         pole = complex(start)
@@ -165,17 +181,20 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Ma
             continue
         rank = int((values > tolerance).sum())
         single = abs(at.imag) <= _SAME_POLE
-        margin &= ranks.judged(values / tolerance, U, rank, 1 if single else 2)
+        states = 1 if single else 2
+        margin &= ranks.judged(values / tolerance, U, rank, states)
         vectors = U[:, rank:]
         if not vectors.shape[1]:
             continue
         known = np.append(known, at)
-        parts = np.real(vectors) if single else np.hstack((vectors.real, vectors.imag))
+        parts = np.real(vectors)
+        if not single:
+            parts = np.hstack((vectors.real, vectors.imag))
         # Poles that differ only by rounding error have the same left vectors, so only new
         # directions are added.
-        new = parts - found @ (found.T @ parts)
-        found = np.hstack((found, ranks.image(new, _SUSPICIOUS)[0]))
-    return found, margin
+        new = parts - basis @ (basis.T @ parts)
+        basis = np.hstack((basis, ranks.image(new, _SUSPICIOUS)[0]))
+    return basis, margin
 
 
 def unobservable(
@@ -211,7 +230,9 @@ def unobservable(
     none, empty = (ranks.Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
     fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
-    unit = slow / fast if fast and slow else 1.0
+    unit = 1.0
+    if fast and slow:
+        unit = slow / fast
     scale = np.concatenate((1.0 / system.size, unit / system.size))
     seen = ranks.stacked([*rows, [position, velocity]])
     basis, at_origin = ranks.null_space(seen @ np.diag(scale))
@@ -239,24 +260,33 @@ def unobservable(
             return None
         missed.append((pole, shapes))
         motion = np.vstack((shapes, pole * shapes))
-        pair = [pole, pole.conjugate()] if pole.imag else [pole]
-        motions += [motion.real, motion.imag][: len(pair)]
-        poles += [each for each in pair for _ in shapes.T]
+        motions.append(motion.real)
+        poles += [pole] * shapes.shape[1]
+        if pole.imag:
+            motions.append(motion.imag)
+            poles += [pole.conjugate()] * shapes.shape[1]
         decay = max(-pole.real / abs(pole) / (1e2 * ranks.EPS * len(system.M)), 0.0)
         decays.append(ranks.Decision(decay, shapes[:, 0]))
-    known = [pole for pole, _ in missed]
-    near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
-    near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
-    if any(near):
+    if _nearly_equal([pole for pole, _ in missed]):
         return None
     slowest = [] if at_zero.shape[1] else sorted(decays, key=itemgetter(0))[:1]
+    fixed_poles: Values = np.array(poles)
+    if dt:
+        fixed_poles = np.exp(fixed_poles * dt)
     fixed = ranks.FixedPoles(
-        poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
+        poles=fixed_poles,
         decays=not at_zero.shape[1] and all(one.ratio > 1.0 for one in slowest),
         margin=margin,
         settling=ranks.Margin(tuple(slowest)),
     )
     return np.hstack(motions), tuple(missed), fixed
+
+
+def _nearly_equal(poles: list[complex]) -> bool:
+    """Return whether two of the poles, or a pole and its complex conjugate, nearly coincide."""
+    near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(poles) for b in poles[:i]]
+    near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in poles]
+    return any(near)
 
 
 def _missed_shapes_at(
@@ -279,7 +309,8 @@ def _missed_shapes_at(
         pencil = (s * s * M + s * D + K) / units
         seen = (position.values + s * velocity.values) / weight
         stack = np.vstack((pencil, seen)), np.vstack((spread, noise))
-        values, vectors, rank, margin = ranks.right_vectors(*stack, 2 if pole.imag else 1)
+        states = 2 if pole.imag else 1
+        values, vectors, rank, margin = ranks.right_vectors(*stack, states)
         shapes = vectors / weight[:, None]
         refined = _root(system, shapes[:, -1], pole)
         moved = abs(refined - pole) / size
@@ -296,7 +327,9 @@ def _root(system: SecondOrder, shape: Values, near: complex) -> complex:
         left = shape.conj()  # shape^T M shape may vanish if two poles are equal
     a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
     root = np.sqrt(complex(b * b - 4.0 * a * c))
-    q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
+    if not (np.conj(b) * root).real >= 0.0:
+        root = -root
+    q = -(b + root) / 2.0
     roots = [q / a, c / q] if q else [0j]
     refined = complex(min(roots, key=lambda value: abs(value - near)))
     if not near.imag:

@@ -66,7 +66,9 @@ def checked(lin: LinearModel) -> LinearModel:
 
 def rate_matrix(lin: LinearModel) -> Array:
     """Return A, or (A - I)/dt of a sampled model, which has the same invariant subspaces."""
-    return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
+    if not lin.dt:
+        return lin.A
+    return (lin.A - np.eye(len(lin.A))) / lin.dt
 
 
 def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
@@ -130,13 +132,13 @@ class SecondOrder:
         if D.any():
             fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
             A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
-            found = np.linalg.eigvals(A) * fastest
+            poles = np.linalg.eigvals(A) * fastest
         else:
             roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
-            found = np.concatenate((roots, -roots))
+            poles = np.concatenate((roots, -roots))
             zeros = 2 * zeros
-        found = found[np.argsort(np.abs(found))][zeros:]
-        return found[found.imag >= 0.0], margin & other
+        poles = poles[np.argsort(np.abs(poles))][zeros:]
+        return poles[poles.imag >= 0.0], margin & other
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
@@ -166,12 +168,12 @@ def second_order(lin: LinearModel) -> SecondOrder:
     forces = ranks.Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # The norm of each column of S sets the threshold for the entries of this column.
-    each = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
+    column_sizes = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
         M=M,
         K=ranks.without_rounding(K @ -N, size, size),
         D=ranks.without_rounding(D @ -np.eye(nv), size, size),
-        S=ranks.without_rounding(S, size, each),
+        S=ranks.without_rounding(S, size, column_sizes),
     )
 
 
@@ -221,7 +223,9 @@ def rates_of_positions(X: Array) -> Array:
     """
     nv = len(X) // 2
     N = X[:nv, nv:]
-    return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
+    if np.linalg.cond(N) < 1e6:
+        return N
+    return np.eye(nv)
 
 
 def energy_units(M: Array, N: Array) -> tuple[Array, Array]:
@@ -341,8 +345,11 @@ def grouped(names: tuple[str, ...]) -> list[str]:
     groups: dict[str, list[str]] = {}
     for name in names:
         axes = _AXIS.findall(name)
-        key = _AXIS.sub("\0", name) if len(axes) == 1 else name
-        groups.setdefault(key, []).extend(axes[: len(axes) == 1])
+        if len(axes) == 1:
+            key = _AXIS.sub("\0", name)
+            groups.setdefault(key, []).extend(axes)
+        else:
+            groups.setdefault(name, [])
     return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
 
 
@@ -361,8 +368,11 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     terms: list[str] = []
     for i in shown[:most]:
         value = f"{abs(weights[i]):.3g}"
-        sign = ("-" if weights[i] < 0.0 else "+") + " " * bool(terms)
-        terms.append(sign + (names[i] if value == "1" else f"{value} {names[i]}"))
+        sign = "-" if weights[i] < 0.0 else "+"
+        if terms:
+            sign += " "
+        factor = "" if value == "1" else f"{value} "
+        terms.append(f"{sign}{factor}{names[i]}")
     if len(shown) > most:
         terms.append(f"+ {len(shown) - most} more")
     return " ".join(terms).removeprefix("+")
@@ -372,18 +382,20 @@ def undecided(
     lin: LinearModel, fixed: ranks.FixedPoles, what: str, count: int, settled: str = ""
 ) -> tuple[str, ...]:
     """Return notes on undecided ranks, and on the slowest motion if its decay is undecided."""
-    ranks = [
-        f"undecided: {shape(lin, at)} counts as {'' if change < 0 else 'not '}{what}, but the "
-        f"test value is only {ratio:.1g} times its rounding error; {count} or {count + change} "
-        f"of {len(lin.A)} states are {what}"
-        for ratio, at, change in fixed.margin.doubts
-    ]
+    notes = list[str]()
+    for ratio, at, change in fixed.margin.doubts:
+        decision = what if change < 0 else f"not {what}"
+        notes.append(
+            f"undecided: {shape(lin, at)} counts as {decision}, but the test value is only "
+            f"{ratio:.1g} times its rounding error; {count} or {count + change} of {len(lin.A)} "
+            f"states are {what}"
+        )
     decays = [
         f"undecided: {shape(lin, at)} may or may not decay by itself, because its decay rate is "
         f"only {ratio:.1g} times its rounding error; the model may or may not be {settled}"
         for ratio, at, _ in fixed.settling.doubts
     ]
-    return (*ranks, *decays)
+    return (*notes, *decays)
 
 
 def shape(lin: LinearModel, at: Values) -> str:

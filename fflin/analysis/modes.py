@@ -103,12 +103,16 @@ class Mode(FrozenArrays):
     @property
     def damping_ratio(self) -> float:
         """Damping ratio -Re(p)/abs(p): 0 if undamped, 1 if real and stable, < 0 if unstable."""
-        return 0.0 if self.pole.real == 0.0 else -self.pole.real / abs(self.pole)
+        if self.pole.real == 0.0:
+            return 0.0
+        return -self.pole.real / abs(self.pole)
 
     @property
     def time_constant(self) -> float:
         """Time [s] in which the mode decays, or grows if it is unstable, by a factor e."""
-        return float("inf") if self.pole.real == 0.0 else 1.0 / abs(self.pole.real)
+        if self.pole.real == 0.0:
+            return float("inf")
+        return 1.0 / abs(self.pole.real)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +190,10 @@ class Modes:
             if 0.1 < abs(mode.margin) < 10.0
         ]
         if self.modes and not self.modes[0].energy:
-            said = "the kinetic energies of the bodies are unknown, because the model was loaded "
-            notes.append(f"{said}from a file")
+            notes.append(
+                "the kinetic energies of the bodies are unknown, because the model was loaded "
+                "from a file"
+            )
         return tuple(notes)
 
     @property
@@ -195,7 +201,9 @@ class Modes:
         """All nx eigenvalues of A [rad/s], including zero and conjugate eigenvalues."""
         listed = [0j] * self.zero_eigenvalues
         for mode in self.modes:
-            listed += [mode.pole, mode.pole.conjugate()] if mode.oscillates else [mode.pole]
+            listed.append(mode.pole)
+            if mode.oscillates:
+                listed.append(mode.pole.conjugate())
         return np.array(listed)
 
     def __str__(self) -> str:
@@ -207,21 +215,25 @@ class Modes:
             f"({counted(self.zero_eigenvalues, 'eigenvalue')} at zero), "
             f"{counted(vibrations, 'vibration')}"
         )
-        head += f", {counted(others, 'real pole')}" if others else ""
+        if others:
+            head += f", {counted(others, 'real pole')}"
         if not self.equilibrium:
             head += "; not an equilibrium: eigenvalues of a frozen model do not show stability"
-        said = [head]
+        lines = [head]
         if self.unstable:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
-            said.append(f"unstable poles (positive real part): {poles}")
-        said += [f"note: {note}" for note in self.notes]
-        parts = [folded([each]) for each in said]
+            lines.append(f"unstable poles (positive real part): {poles}")
+        lines += [f"note: {note}" for note in self.notes]
+        parts = [folded([line]) for line in lines]
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         for mode in self.modes:
-            swing = f"{mode.frequency:.6g}", f"{mode.damping_ratio:.4g}"
+            frequency = damping = "."
+            if mode.oscillates:
+                frequency = f"{mode.frequency:.6g}"
+                damping = f"{mode.damping_ratio:.4g}"
             decay = f"{mode.time_constant:.4g}" if mode.pole.real else "."
-            growth = "unstable" * mode.unstable
-            rows.append([*(swing if mode.oscillates else ".."), decay, growth, ""])
+            growth = "unstable" if mode.unstable else ""
+            rows.append([frequency, damping, decay, growth, ""])
         left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
         for row, mode in zip(rows[1:], self.modes, strict=True):
             row[-1] = _percents(mode.energy, width() - left)
@@ -257,7 +269,8 @@ class Modes:
         of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]
         for name, parts in effective_shares(robot._bare.model, robot.appendages).items():
             cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
-            of_masses.append([name, f"{clamped[name]:.6g}" if name in clamped else ".", *cells])
+            frequency = f"{clamped[name]:.6g}" if name in clamped else "."
+            of_masses.append([name, frequency, *cells])
         title = (
             "effective masses and moments of inertia about the frame of the appendage, in % of "
             "the inertia of the body that carries it, or of the inertia in its file"
@@ -332,13 +345,14 @@ def modes(lin: LinearModel) -> Modes:
     weight = np.concatenate((fastest * inertia, inertia))
     pairs, rigid_body = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
     # Pole, shape and margin of each mode
-    found: list[tuple[complex, Complex, float]] = []
+    eigenmodes: list[tuple[complex, Complex, float]] = []
     residual = 0.0
     for scaled_pole, vector, error in pairs:
         if scaled_pole.imag < 0.0:
             continue
         oscillates = abs(scaled_pole.real) <= error and scaled_pole.imag
-        pole = complex(0.0 if oscillates else scaled_pole.real, scaled_pole.imag) * fastest
+        growth = 0.0 if oscillates else scaled_pole.real
+        pole = complex(growth, scaled_pole.imag) * fastest
         shape = vector / weight
         left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
@@ -348,12 +362,14 @@ def modes(lin: LinearModel) -> Modes:
         largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
         shape = np.asarray(shape / shape[largest], complex)
         margin = scaled_pole.real / error
-        found.append((pole, shape, margin))
-    shapes = np.array([shape for _, shape, _ in found], complex).reshape(len(found), 2 * nv)
+        eigenmodes.append((pole, shape, margin))
+    shapes = np.array([shape for _, shape, _ in eigenmodes], complex).reshape(
+        len(eigenmodes), 2 * nv
+    )
     energies = energies_of(lin._robot, lin, shapes)
     listed = [
         Mode(pole, shape, margin > 1.0, margin, energy, strain)
-        for (pole, shape, margin), (energy, strain) in zip(found, energies, strict=True)
+        for (pole, shape, margin), (energy, strain) in zip(eigenmodes, energies, strict=True)
     ]
     return Modes(
         tuple(sorted(listed, key=lambda mode: (abs(mode.pole), mode.pole.real))),
@@ -377,8 +393,9 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
     text = ""
     for count in range(len(words), 0, -1):
         left = sum(list(energy.values())[count:])
-        others = f"; + {len(energy) - count} more {100.0 * left:.0f} %" if left >= 0.005 else ""
-        text = ", ".join(words[:count]) + others
+        text = ", ".join(words[:count])
+        if left >= 0.005:
+            text += f"; + {len(energy) - count} more {100.0 * left:.0f} %"
         if len(text) <= room:
             break
     return text
@@ -417,7 +434,7 @@ def energies_of(
     elastic = robot.springs.stiffness[:, None] * np.abs(moved[6:]) ** 2
     names = _body_names(robot)
     bodies = {i for i in range(len(names)) if i + ROOT not in carriers}
-    found: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
+    fractions: list[tuple[Mapping[str, float], Mapping[str, float]]] = []
     for of_bodies, of_springs in zip(kinetic.T, elastic.T, strict=True):
         parts = of_bodies / (of_bodies.sum() or 1.0)
         order = np.argsort(-parts.round(9), kind="stable").tolist()
@@ -425,8 +442,8 @@ def energies_of(
         parts = of_springs / (of_springs.sum() or 1.0)
         order = np.argsort(-parts, kind="stable").tolist()
         strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
-        found.append((energy, strain))
-    return found
+        fractions.append((energy, strain))
+    return fractions
 
 
 def _body_names(robot: Robot) -> list[str]:
@@ -441,7 +458,8 @@ def _body_names(robot: Robot) -> list[str]:
     root_link = links.pop(ROOT, "base")
     joints = enumerate(list(robot.model.names)[ROOT + 1 :], ROOT + 1)
     names = [links.get(index, name) for index, name in joints]
-    return [root_link if "base" in names else "base", *names]
+    base = root_link if "base" in names else "base"
+    return [base, *names]
 
 
 def _energies(robot: Robot, q: Array, v: Array) -> Array:

@@ -122,8 +122,10 @@ def unobserved(lin: LinearModel, C: Array | None = None) -> Array:
         return motions
     shown = mechanics.outputs_without_rounding(lin, C).values
     # In other axes, the angular velocity changes with the attitude.
-    turns = not IN_REFERENCE_AXES[lin.frame][0]
-    for group in ("r_b", "v_b", "q_b") if turns else ("r_b", "v_b"):
+    groups = ["r_b", "v_b"]
+    if not IN_REFERENCE_AXES[lin.frame][0]:
+        groups.append("q_b")
+    for group in groups:
         members = [i for i, name in enumerate(lin.state_names) if name.partition(".")[0] == group]
         if len(members) != 3 or shown[:, members].any():
             break
@@ -142,7 +144,9 @@ def all_coordinates_driven(lin: LinearModel) -> ranks.Margin | None:
         return None
     system = mechanics.second_order(lin)
     idle, margin = ranks.null_space(system.S.T, 1.0 / system.size)
-    return None if idle.shape[1] else margin
+    if idle.shape[1]:
+        return None
+    return margin
 
 
 def all_coordinates_measured(lin: LinearModel) -> ranks.Margin | None:
@@ -162,7 +166,9 @@ def all_coordinates_measured(lin: LinearModel) -> ranks.Margin | None:
     static = ~C.values[:, nv:].any(axis=1)
     positions = ranks.Noisy(C.values[static, :nv], C.noise[static, :nv])
     hidden, margin = ranks.null_space(positions, scale[:nv])
-    return None if hidden.shape[1] else margin
+    if hidden.shape[1]:
+        return None
+    return margin
 
 
 def steadiness(lin: LinearModel) -> tuple[str, ...]:
@@ -182,4 +188,5 @@ def steadiness(lin: LinearModel) -> tuple[str, ...]:
 
 def constant_poles(count: int, dt: float) -> Array:
     """Return the poles (count,) of quantities that stay constant."""
-    return np.full(count, 1.0 if dt else 0.0)
+    pole = 1.0 if dt else 0.0
+    return np.full(count, pole)

@@ -74,7 +74,9 @@ class Observability(RankAnalysis):
     detectable: bool | None
 
     def __str__(self) -> str:
-        lines = [f"unobservable: {', '.join(self.unobservable)}"] if self.unobservable else []
+        lines = list[str]()
+        if self.unobservable:
+            lines.append(f"unobservable: {', '.join(self.unobservable)}")
         parts = ("position", "velocity", "attitude")[: (len(self.basis) - self.bound) // 3]
         limit = f"no output depends on the {listed(parts)} of the base"
         return self._summary("observable", limit, verdict(self.detectable, "detectable"), lines)
@@ -138,10 +140,11 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
         shown = mechanics.outputs_without_rounding(lin, C)
         position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
-        if found := unobservable(system, position, velocity, lin.dt):
-            motions, _, fixed = found
+        if hidden := unobservable(system, position, velocity, lin.dt):
+            motions, _, fixed = hidden
             motions = np.vstack((N @ motions[:nv], motions[nv:]))
-            method = "eigenvalues" if system.acting else "closed form"
+            if not system.acting:
+                method = "closed form"
     if motions is None:
         # The unobservable subspace is the uncontrollable part of the dual pair (A^T, C^T).
         X = mechanics.rate_matrix(lin)
@@ -188,6 +191,7 @@ def _in_motion(lin: LinearModel) -> Observability:
     motions = np.hstack((known, others))
     fixed = fixed._replace(settling=Margin())  # the frozen poles do not decide about decay
     undecided = mechanics.undecided(lin, fixed, "observable", nx - motions.shape[1])
+    detectable = False if known.shape[1] else None
     return _result(
         lin,
         motions,
@@ -195,7 +199,7 @@ def _in_motion(lin: LinearModel) -> Observability:
         fixed_poles=np.concatenate(
             (moving_points.constant_poles(known.shape[1], lin.dt), fixed.poles)
         ),
-        detectable=False if known.shape[1] else None,
+        detectable=detectable,
         method=FROZEN,
         margin=fixed.margin,
         notes=(moving_points.NOTE, *notes, *undecided),
@@ -211,14 +215,18 @@ def _along(traj: LinearTrajectory) -> Observability:
     nx = len(motions)
     dimension = nx - motions.shape[1]
     fixed = FixedPoles(margin=split.margin)
-    detectable = None if motions.shape[1] else True
+    detectable: bool | None = True
+    if motions.shape[1]:
+        detectable = None
+    if known.shape[1]:
+        detectable = False
     return _result(
         first,
         motions,
         bound=dimension,
         duration=float(traj.t[-1] - traj.t[0]),
         fixed_poles=np.zeros(0),
-        detectable=False if known.shape[1] else detectable,
+        detectable=detectable,
         method=GRAMIAN,
         margin=split.margin,
         notes=mechanics.undecided(first, fixed, "observable", dimension),
@@ -260,17 +268,17 @@ def _result(
     )
 
 
-def lasting_motions(lin: LinearModel, found: Observability) -> tuple[str, ...]:
+def lasting_motions(lin: LinearModel, analysis: Observability) -> tuple[str, ...]:
     """Name the unobservable motions of an analysis that do not decay by themselves."""
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-    basis = found.basis * size[:, None]
+    basis = analysis.basis * size[:, None]
     # The motions span an invariant subspace: A basis = basis F.
     rate = size[:, None] * mechanics.rate_matrix(lin) / size
     F = np.linalg.pinv(basis) @ rate @ basis
     motions = lasting(F, lin.dt)
     if motions.shape[1] in (0, len(F)):
-        return found.unobservable
-    lasts, _ = echelon(found.basis @ motions, size)
+        return analysis.unobservable
+    lasts, _ = echelon(analysis.basis @ motions, size)
     return tuple(mechanics.combination(column, lin.state_names, size) for column in lasts.T)
 
 
@@ -350,9 +358,14 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     if duration is None:
         poles = np.linalg.eigvals(lin.A)
         size = float(np.abs(poles).max())
-        growth = size - 1.0 if lin.dt else float(poles.real.max())
-        if growth >= -_DECAY * (1.0 if lin.dt else size):
-            slow = f"of modulus {size:.6g}" if lin.dt else f"at {growth:.3g} 1/s"
+        growth = float(poles.real.max())
+        allowed = -_DECAY * size
+        slow = f"at {growth:.3g} 1/s"
+        if lin.dt:
+            growth = size - 1.0
+            allowed = -_DECAY
+            slow = f"of modulus {size:.6g}"
+        if growth >= allowed:
             raise InputError(
                 f"the model is not asymptotically stable (a pole {slow}), so its infinite-time "
                 "Gramians are not finite; give duration= for finite-time Gramians"
@@ -360,14 +373,15 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     else:
         duration = positive("duration", duration, "s")
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
-    if not all(np.isfinite(W).all() for W in found):
+        matrices = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
+    if not all(np.isfinite(W).all() for W in matrices):
         raise InputError(
             f"duration is {duration:g} s, over which the state transition matrix overflows; give "
             "a shorter duration"
         )
-    reach, show = (0.5 * (W + W.T) for W in found)
-    return Gramians(reach, show, np.inf if duration is None else duration)
+    reach, show = (0.5 * (W + W.T) for W in matrices)
+    span = np.inf if duration is None else duration
+    return Gramians(reach, show, span)
 
 
 def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:

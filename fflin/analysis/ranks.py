@@ -70,8 +70,11 @@ class Margin(NamedTuple):
         """
         moved = []
         for one in self.decisions:
-            v = max(np.split(one.at, 2), key=np.linalg.norm) if halved else one.at
-            moved.append(one._replace(at=change @ v if np.ndim(change) == 2 else change * v))
+            v = one.at
+            if halved:
+                v = max(np.split(one.at, 2), key=np.linalg.norm)
+            at = change @ v if np.ndim(change) == 2 else change * v
+            moved.append(one._replace(at=at))
         return Margin(tuple(moved))
 
     @property
@@ -81,8 +84,12 @@ class Margin(NamedTuple):
         If the rank is decided the other way, the number of controllable or observable states
         changes by `change`.
         """
-        counted = [each for each in self.decisions if each.ratio == self.kept < CLEAR][:1]
-        left_out = [each for each in self.decisions if each.ratio == self.dropped > LOST][:1]
+        counted = [decision for decision in self.decisions if decision.ratio == self.kept < CLEAR][
+            :1
+        ]
+        left_out = [
+            decision for decision in self.decisions if decision.ratio == self.dropped > LOST
+        ][:1]
         return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
 
 
@@ -138,7 +145,9 @@ def verdict(decided: bool | None, adjective: str) -> str:
     """Return an adjective that ends in "-able", negated or undecided if `decided` says so."""
     if decided is None:
         return f"{adjective.removesuffix('able')}ability is undecided"
-    return adjective if decided else f"not {adjective}"
+    if decided:
+        return adjective
+    return f"not {adjective}"
 
 
 class Noisy(NamedTuple):
@@ -211,7 +220,8 @@ def right_vectors(
     weights = 1.0 / np.maximum(sizes[real], spread[real] / least)
     tolerance = SAFETY * max(least, float(np.linalg.norm(spread[real] * weights)))
     rows = values[real] * weights[:, None]
-    rows = rows if np.imag(rows).any() else np.real(rows)
+    if not np.imag(rows).any():
+        rows = np.real(rows)
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
     singular = np.pad(singular, (0, n - len(singular)))
     rank = int((singular > tolerance).sum())
@@ -264,7 +274,9 @@ def lasting(F: Array, dt: float) -> Array:
 
     def lasts(real: float, imaginary: float) -> bool:
         rate = complex(real, imaginary)
-        decay = (1.0 - abs(1.0 + dt * rate)) / dt if dt else -real
+        decay = -real
+        if dt:
+            decay = (1.0 - abs(1.0 + dt * rate)) / dt
         return decay <= least
 
     _, vectors, count = schur(F, sort=lasts)
@@ -296,7 +308,9 @@ def echelon(
     weighted = np.linalg.qr(columns * weights[:, None])[0]
     # Preferred rows are weighted by 1,000. A larger weight could select pivots so small that the
     # basis loses accuracy.
-    graded = weighted if preferred is None else weighted * np.where(preferred, 1e3, 1.0)[:, None]
+    graded = weighted
+    if preferred is not None:
+        graded = weighted * np.where(preferred, 1e3, 1.0)[:, None]
     pivots = np.sort(qr(graded.T, mode="r", pivoting=True)[1][:size])
     basis = np.linalg.solve(columns[pivots].T, columns.T).T
     relative = np.abs(basis) * weights[:, None] / weights[pivots]

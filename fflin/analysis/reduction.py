@@ -90,14 +90,14 @@ class ReducedModel(LinearModel):
     def _report(self) -> str:
         """Return the title, the numbers of states and conserved momenta, and the notes."""
         count = len(self.momenta)
-        momenta = f"{count} conserved {'momentum' if count == 1 else 'momenta'}"
+        noun = "momentum" if count == 1 else "momenta"
         states = f"{len(self.S)} of {counted(len(self.T), 'state')} are kept: "
         notes = (f"note: {note}" for note in self.notes)
         return folded(
             [
                 repr(self),
                 states + listed(self.state_names),
-                f"{momenta} and the coordinates with these rates are removed",
+                f"{count} conserved {noun} and the coordinates with these rates are removed",
                 *notes,
             ]
         )
@@ -473,5 +473,7 @@ def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     model.
     """
     source = lin.generator
-    whole = lin if not lin.dt or source is None else make(source)
+    whole = lin
+    if lin.dt and source is not None:
+        whole = make(source)
     return replace(part, _source=(part.fingerprint, whole))

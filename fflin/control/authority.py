@@ -146,9 +146,12 @@ def wheel_momentum(robot: Robot, data: pin.Data, v: Array) -> WheelMomentum:
             add_joint(name, inertia)
     directions = np.array(axes).reshape(-1, 3)
     most = np.array(largest)
-    rank = int(np.linalg.matrix_rank(directions, tol=1e-6)) if axes else 0
-    bounded = rank == 3 and np.isfinite(most).all()
-    least = least_reach(directions.T, -most, most, np.eye(3)) if bounded else None
+    rank = 0
+    if axes:
+        rank = int(np.linalg.matrix_rank(directions, tol=1e-6))
+    least = None
+    if rank == 3 and np.isfinite(most).all():
+        least = least_reach(directions.T, -most, most, np.eye(3))
     return WheelMomentum(len(axes), np.array(stored) @ directions, rank, least)
 
 
@@ -164,7 +167,7 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
         return ThrusterAuthority(0)
     W = actuation.columns(robot.create_data(), q)[:6, thrusters]
     W[:3] -= np.cross(center, W[3:].T).T
-    low, high = (each[thrusters] for each in input_limits(robot, limits_of(robot)))
+    low, high = (bound[thrusters] for bound in input_limits(robot, limits_of(robot)))
     every_way = gives_every_wrench(W, np.full(count, True))
     bounded = bool(np.isfinite(high).all())
     if not (every_way and bounded and count <= _MANY):
@@ -236,8 +239,8 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
         within = np.linalg.norm(normals / scale @ kept, axis=1)
         crossing = within > _ROUNDING * np.linalg.norm(normals / scale, axis=1)
         along = (normals / scale)[crossing] @ W
-        for each in (along, -along):
-            reach = np.maximum(each * low, each * high).sum(axis=1) / within[crossing]
+        for components in (along, -along):
+            reach = np.maximum(components * low, components * high).sum(axis=1) / within[crossing]
             least = min(least, float(reach.min(initial=math.inf)))
     return least
 

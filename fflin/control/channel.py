@@ -83,12 +83,13 @@ def saturation(
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         why = (
-            f"has a least impulse of {item.least_impulse:g} N s, too large for a sample of "
-            f"{time:g} s; give a longer sample="
-            if time
-            else "is pulsed, which needs sampled commands; give sample= (--sample), or a sampled "
-            "policy"
+            "is pulsed, which needs sampled commands; give sample= (--sample), or a sampled policy"
         )
+        if time:
+            why = (
+                f"has a least impulse of {item.least_impulse:g} N s, too large for a sample of "
+                f"{time:g} s; give a longer sample="
+            )
         raise InputError(f"thruster '{name}' {why}")
     pulses = within.pulses._replace(
         at=np.array(at),
@@ -119,8 +120,8 @@ def warn_beyond(
         for k, ((name, unit), row) in enumerate(zip(units.items(), worst, strict=True))
         if exceeded[k]
     ]
-    said = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
-    warnings.warn(said, FflinWarning, stacklevel=3)
+    message = f"the input limits are too small for '{robot}' {where}: {listed(beyond)}"
+    warnings.warn(message, FflinWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +138,8 @@ class Law:
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
-        own = type(u) is np.ndarray and u.dtype is DOUBLE
-        u = np.array(u) if own else as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        is_double = type(u) is np.ndarray and u.dtype is DOUBLE
+        u = np.array(u) if is_double else as_double(f"policy(t, q, v) at t = {t:g} s", u)
         names = self.names
         shape = (len(self.names),)
         if u.shape == shape and math.isfinite(u.dot(u)):
@@ -163,7 +164,9 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
     Until the first command arrives, the channel applies the inputs `initial` (nu,), saturated at
     their limits.
     """
-    slots = delay // sample + 1 if sample else 1
+    slots = 1
+    if sample:
+        slots = delay // sample + 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
         **limits._replace(pulses=limits.pulses._replace(**fresh))._asdict(),
@@ -195,7 +198,8 @@ def channelled(
     def applied(step: int, *point: object) -> Array:
         if rules.is_asked(channel, step):
             u[:] = law(*point)
-        rules.transmit(channel, step, speeds(*point) if wheels else u[:0], u)
+        wheel_speeds = speeds(*point) if wheels else u[:0]
+        rules.transmit(channel, step, wheel_speeds, u)
         return u.copy()
 
     return applied

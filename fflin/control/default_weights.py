@@ -104,7 +104,8 @@ def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) 
     pace = pace._replace(bandwidth=max(pace.bandwidth, _OF_FALL * _rate_of_fall(lin)))
     damping = _damping(lin)
     w = pace.bandwidth
-    for _ in range(_PASSES if damping.any() else 1):
+    passes = _PASSES if damping.any() else 1
+    for _ in range(passes):
         before = w
         M = lin.M + damping / w
         Q, R, rule, w, terms = _of_inertia(lin, M, np.linalg.inv(N), pace, momenta)
@@ -190,9 +191,9 @@ def _of_inertia(
     if loaded:
         least = min(Limit(_LEAST_OF_GROWTH * growth, mode), limit)
         limit, achieved = _slowed(lin, costs, size, size * ~idle, limit, least)
-    rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION) + (
-        "; joint damping is included" if damped else ""
-    )
+    rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION)
+    if damped:
+        rule += "; joint damping is included"
     terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
 
@@ -243,12 +244,12 @@ def _on_velocities(
     L = np.linalg.solve(lin.M, root)
     F, H = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L), np.linalg.solve(L, X[m:, m:] @ L)
     _, stiffness, modes = np.linalg.svd(F)
-    own = H.T @ H * damped
+    damping_term = H.T @ H * damped
     back = np.linalg.inv(L)
 
     def at(w: float) -> Array:
         part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
-        values, directions = np.linalg.eigh((modes.T * part) @ modes - own)
+        values, directions = np.linalg.eigh((modes.T * part) @ modes - damping_term)
         rows = directions.T @ back
         weight: Array = (rows.T * values.clip(0.0)) @ rows / w**4
         return 0.5 * (weight + weight.T)
@@ -310,7 +311,8 @@ def _fastest(
     # M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
+    power = 1 if (mass == 1.0).all() else 2
+    first = 0.1 / rates[-1] ** power
     time = np.geomspace(first, 3.0, 60)[:, None]
     fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
     moving = (rates**2 * (slow - fast) / root).real
@@ -321,18 +323,24 @@ def _fastest(
 
 def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
-    base = [f"{turn:g} deg"] * ("q_b" in groups)
+    base = list[str]()
+    if "q_b" in groups:
+        base.append(f"{turn:g} deg")
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
     sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
     units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
-    largest = {unit: max(d for of, d, _ in sizes if of == unit) for unit in units}
-    from_where = [f"{' and '.join(base)} of the base"] if base else []
+    largest = {unit: max(d for joint_unit, d, _ in sizes if joint_unit == unit) for unit in units}
+    from_where = list[str]()
+    if base:
+        from_where.append(f"{' and '.join(base)} of the base")
     if largest:
-        each = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
-        from_where.append(f"{each} of the joints")
+        offsets = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
+        from_where.append(f"{offsets} of the joints")
     source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
-    slow = f"; bandwidth limited by {limit.what}" if limit.what else ""
+    slow = ""
+    if limit.what:
+        slow = f"; bandwidth limited by {limit.what}"
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += (
             f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
@@ -356,14 +364,14 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     return total
 
 
-def _limits_on(what: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
+def _limits_on(kind: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
     """Return, for each limited signal, the factor on the bandwidth at which it reaches its limit.
 
     `room` maps the name of each signal to its limit. With a factor of 1, the largest values of the
     signals are `used`. The values are proportional to the factor raised to the power `power`.
     """
     return [
-        Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
+        Limit((most / size) ** (1.0 / power), f"the {kind} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]
@@ -423,16 +431,16 @@ def _slowed(
         left, effort = min(efforts, default=Limit(1.0, ""))
         decay = -rates.real
         fast = np.abs(rates)
-        said = (
+        description = (
             f"bandwidth at least {fast.min():.3g} rad/s, decay rate at least {decay.min():.3g} "
             f"1/s, damping ratio at least {(decay / fast).min():.2g}"
         )
         slow = decay < _AS_SLOW * math.sqrt(0.5) * w
         if names := _moving_most(lin, modes[:, slow]):
-            said += f"; modes decaying more slowly: {listed(names)}"
+            description += f"; modes decaying more slowly: {listed(names)}"
         if left >= 1.0 - 1e-6:
-            return limit, said
-        trials.append((left, effort, limit, said, np.abs(lin.u0) + use))
+            return limit, description
+        trials.append((left, effort, limit, description, np.abs(lin.u0) + use))
         if w <= least.bandwidth:
             break
         # Springs and gravity require efforts even if the loop is very slow, so the factor `left` is
@@ -441,15 +449,16 @@ def _slowed(
     if not trials:
         return limit, ""  # the later design of the regulator also fails, and reports the reason
     enough = _IN_VAIN * max(left for left, *_ in trials)
-    _, effort, (w, reason), said, required = next(x for x in trials if x[0] >= enough)
+    _, effort, (w, reason), description, required = next(x for x in trials if x[0] >= enough)
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
     warn_beyond(lin.robot, where, units, required[None], -high, high)
-    # True if an unstable mode or the sampling time determines the bandwidth, and not an effort.
-    held = reason == least.what
-    what = f"{reason}; {effort} {_NOT_ENOUGH}" if held else f"{effort}, which {_NOT_ENOUGH}"
-    return Limit(w, what), said
+    cause = f"{effort}, which {_NOT_ENOUGH}"
+    if reason == least.what:
+        # An unstable mode or the sampling time determines the bandwidth, and not an effort.
+        cause = f"{reason}; {effort} {_NOT_ENOUGH}"
+    return Limit(w, cause), description
 
 
 def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
@@ -461,7 +470,7 @@ def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
-    return [name for name, here in zip(lin.state_names[:m], among, strict=False) if here]
+    return [name for name, moves in zip(lin.state_names[:m], among, strict=False) if moves]
 
 
 # Along a trajectory, the design displacements are multiplied by _BESIDE. They should decay within

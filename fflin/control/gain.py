@@ -158,8 +158,11 @@ class Gain(ModelDesign):
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
         left = [name for name in self.state_names if self.regulated and name not in self.regulated]
+        not_regulated = ""
+        if left:
+            not_regulated = f"{listed(left)} ({_why_not_regulated(left)})"
         more = {
-            "not regulated": f"{listed(left)} ({_why_not_regulated(left)})" if left else "",
+            "not regulated": not_regulated,
             "held at the operating point": "; ".join(self._held()),
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
@@ -172,7 +175,7 @@ class Gain(ModelDesign):
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
         head = f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
-        notes = [fold(f"{what}: {said}") for what, said in more.items() if said]
+        notes = [fold(f"{label}: {text}") for label, text in more.items() if text]
         return "\n\n".join(
             (
                 head,
@@ -188,8 +191,10 @@ class Gain(ModelDesign):
         if not self.u0.any():
             return []
         inputs = signals("u0", self.u0, self.input_names, self.input_units)
-        gained = () if self._lin is None else wheel_notes(self._lin)
-        return [" ".join(inputs.split()), *gained]
+        notes = [" ".join(inputs.split())]
+        if self._lin is not None:
+            notes += wheel_notes(self._lin)
+        return notes
 
     @property
     def closed_loop(self) -> Array:
@@ -246,7 +251,9 @@ class Gain(ModelDesign):
             D = D - H @ inverse @ G
             F, G, H = inverse @ (F - unit), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
         disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
-        most = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf
+        most = math.inf
+        if disk < 2.0:
+            most = (2.0 + disk) / (2.0 - disk)
         phase = math.degrees(2.0 * math.atan(disk / 2.0))
         return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
 
@@ -298,12 +305,12 @@ def make_gain(
 
 def cautions(gain: Gain) -> list[str]:
     """Return warnings about a small disk margin at the inputs, and about negative thrust."""
-    said: list[str] = []
+    messages: list[str] = []
     if not _has_margin_of_kalman(gain) and (margins := gain.margins).disk < _FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
         if gain.dt:
             remedy = "shorten dt, or slow the loop as the default weights do"
-        said.append(
+        messages.append(
             f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
             f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
             f"unstable; {remedy}"
@@ -313,19 +320,19 @@ def cautions(gain: Gain) -> list[str]:
         name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
     if thrusters:
-        said.append(
+        messages.append(
             f"the gain commands negative thrust ({listed(thrusters)}), which is cut at zero, so "
             "the poles and margins do not hold; design with torque and force on the base, and "
             "allocate them to the thrusters with fflin.Allocation. `fflin lqr` and `fflin "
             "simulate` do so by default if the thrusters can push in every direction"
         )
     if stopped := _stopped_rotors(gain):
-        said.append(
+        messages.append(
             f"the operating point moves {listed(stopped)}, which cannot spin forever, because it "
             "has position limits; the gain regulates its angle and so stops it; remove the limits "
             "(type continuous in the URDF) to fly it as a wheel"
         )
-    return said
+    return messages
 
 
 def _why_not_regulated(names: list[str]) -> str:
@@ -385,11 +392,14 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     """
     poles = design.poles[design.poles.imag >= 0.0]
     rates = rates_of(poles, design.dt)
-    heads = ["pole" if design.dt else "pole [1/s]", "frequency [rad/s]", "damping", "times"]
+    pole_title = "pole" if design.dt else "pole [1/s]"
+    heads = [pole_title, "frequency [rad/s]", "damping", "times"]
     rows = Counter[tuple[str, ...]]()
     for k in np.argsort(-rates.real):
         pole, rate = poles[k], rates[k]
-        shown = f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
+        shown = f"{pole.real:.5g}"
+        if pole.imag:
+            shown += f" +- {pole.imag:.5g}i"
         rows[shown, f"{abs(rate):.4g}", f"{-rate.real / abs(rate):.4g}"] += 1
     table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
     if max(rows.values()) == 1:
@@ -439,16 +449,16 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
 
     poles = np.linalg.eigvals(A)
     starts = sorted({0.0, *np.abs(poles).tolist()})
-    found = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, starts))
+    peak = max((float(np.linalg.norm(D, 2)), math.inf), _largest_among(gain, starts))
     while True:
-        bound = found[0] * (1.0 + ACCURACY)
+        bound = peak[0] * (1.0 + ACCURACY)
         crossings, on_axis = gain_crossings(A, B, C, D, bound)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
         between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
-        best = max(map(gain, between.tolist()), default=found)
+        best = max(map(gain, between.tolist()), default=peak)
         if best[0] <= bound:
-            return max(found, best)
-        found = best
+            return max(peak, best)
+        peak = best
 
 
 def _largest_among(
@@ -456,7 +466,9 @@ def _largest_among(
 ) -> tuple[float, float]:
     """Return a large gain at one of the ascending frequencies: the largest, if they are few."""
     count = len(frequencies)
-    step = 1 if count <= _MANY else -(-count // _FEW)
+    step = 1
+    if count > _MANY:
+        step = -(-count // _FEW)
     gains = {index: gain(frequencies[index]) for index in range(0, count, step)}
     # Between the frequencies that were tried, search near the best of them.
     while step > 1:

@@ -198,7 +198,9 @@ class Compensator(ModelDesign):
 
 
 def _time(dt: float) -> str:
-    return f"sampled at {dt:g} s" if dt else "continuous"
+    if dt:
+        return f"sampled at {dt:g} s"
+    return "continuous"
 
 
 def kalman(
@@ -457,8 +459,8 @@ def tvkalman(
     columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
 
     def intensity(t: float) -> Array:
-        (by,) = traj.between(t, columns)
-        spread = by @ noise @ by.T
+        (input_matrix,) = traj.between(t, columns)
+        spread = input_matrix @ noise @ input_matrix.T
         return 0.5 * (spread + spread.T)
 
     if asks_steady(P0, "P0", "a covariance"):
@@ -473,13 +475,15 @@ def tvkalman(
     disturbed = np.zeros((len(held), nx, nx))  # covariance that the disturbance adds per sample
     with riccati.bounded_by("a smaller W or a larger V"):
         for covariance, (steps, _) in zip(disturbed, held, strict=True):
-            early, late = (np.array([intensity(t) for t in of]) for of in steps.nodes.T.tolist())
+            early, late = (
+                np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist()
+            )
             added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * early + LIGHT * late, steps.h)
-            for step, each in zip(steps.maps[:, :, :nx], added, strict=True):
-                covariance[:] = step @ covariance @ step.T + each
+            for step, step_noise in zip(steps.maps[:, :, :nx], added, strict=True):
+                covariance[:] = step @ covariance @ step.T + step_noise
         stages = [
-            (block_diag(each, V), np.hstack((whole[:, :nx].T, C.T)))
-            for each, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
+            (block_diag(process_noise, V), np.hstack((whole[:, :nx].T, C.T)))
+            for process_noise, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
         ]
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)
@@ -500,16 +504,20 @@ def tvkalman(
 
 
 def disturbance(
-    of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
+    model: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
 ) -> tuple[Array, Array]:
     """Return the intensity W (nw, nw) and the input matrix G (.., nx, nw) of the disturbance."""
-    nx = len(of.state_names)
+    nx = len(model.state_names)
     if G is None:
-        return weight("W", W, of.state_names), np.eye(nx)
-    knots = of.A.shape[:1] if dimension("G", G) == of.A.ndim == 3 else ()
+        return weight("W", W, model.state_names), np.eye(nx)
+    knots: tuple[int, ...] = ()
+    hint = ": one column for each disturbance"
+    if dimension("G", G) == model.A.ndim == 3:
+        knots = model.A.shape[:1]
+        hint = ": one matrix for each knot, with one column for each disturbance"
     shape = *knots, nx, max((1, *np.shape(G))[-1], 1)
-    hint = f": {'one matrix for each knot, with ' if knots else ''}one column for each disturbance"
     through = shaped("G", G, shape, hint)
-    same = np.array_equal(through, of.B)
-    names = input_keys(of) if same else [f"w_{i + 1}" for i in range(through.shape[-1])]
+    names = tuple(f"w_{i + 1}" for i in range(through.shape[-1]))
+    if np.array_equal(through, model.B):
+        names = input_keys(model)
     return weight("W", W, names), through

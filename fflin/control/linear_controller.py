@@ -131,16 +131,18 @@ class LinearController(Feedback):
             raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
         if self.noise is not None and not callable(self.noise):
             raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
-        by = _system_of(self.system)
+        controller = _system_of(self.system)
         # Expand the system to all outputs and inputs of the model, and multiply its output by the
         # sign of the feedback.
-        columns = _indices("input", by.inputs, by.D.shape[1], "output", lin.output_names)
-        rows = _indices("output", by.outputs, len(by.D), "input", lin.input_names)
-        nz, (nu, ny) = len(by.A), lin.D.T.shape
+        columns = _indices(
+            "input", controller.inputs, controller.D.shape[1], "output", lin.output_names
+        )
+        rows = _indices("output", controller.outputs, len(controller.D), "input", lin.input_names)
+        nz, (nu, ny) = len(controller.A), lin.D.T.shape
         B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
-        B[:, columns] = by.B
-        C[rows] = self.sign * by.C
-        D[np.ix_(rows, columns)] = self.sign * by.D
+        B[:, columns] = controller.B
+        C[rows] = self.sign * controller.C
+        D[np.ix_(rows, columns)] = self.sign * controller.D
         felt: Mask = np.logical_and(lin.D.any(axis=1), D.any(axis=0))
         if felt.any():
             raise InputError(
@@ -148,16 +150,20 @@ class LinearController(Feedback):
                 f"{listed(compress(lin.output_names, felt))}, because D of both is nonzero "
                 "there; set D of the controller to 0 there, for example with a low-pass filter"
             )
-        dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not nz) else by.dt
+        dt = controller.dt
+        if dt is None or (dt <= 0.0 and not nz):
+            dt = lin.dt
         # A negative dt stands for an unknown sample time. The dt of a sampled model replaces it.
-        dt = lin.dt or dt if dt < 0.0 else dt
+        if dt < 0.0 and lin.dt:
+            dt = lin.dt
         if dt < 0.0 or (lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt):
+            shown = "unknown" if dt < 0.0 else f"{dt:g} s"
             raise InputError(
-                f"the controller has dt = {'unknown' if dt < 0.0 else f'{dt:g} s'}, but the "
-                f"model has dt = {lin.dt:g} s (0: continuous); give a controller with the dt of "
-                "the model, or give the continuous model"
+                f"the controller has dt = {shown}, but the model has dt = {lin.dt:g} s (0: "
+                "continuous); give a controller with the dt of the model, or give the continuous "
+                "model"
             )
-        self.system = System(by.A, B, C, D, dt, lin.output_names, lin.input_names)
+        self.system = System(controller.A, B, C, D, dt, lin.output_names, lin.input_names)
         self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
@@ -275,7 +281,9 @@ class LinearController(Feedback):
     @cached_property
     def loop(self) -> Array:
         """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
-        lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
+        lin = self.lin
+        if self.dt and not lin.dt:
+            lin = lin.discretize(self.dt)
         return self.loop_with(lin)
 
     def loop_with(self, lin: LinearModel) -> Array:
@@ -286,11 +294,11 @@ class LinearController(Feedback):
 
     def sampled(self, dt: float) -> LinearController:
         """Return the controller sampled at dt [s]; a sampled controller is unchanged."""
-        by = self.system
-        if by.dt or not len(by.A):
+        system = self.system
+        if system.dt or not len(system.A):
             return self
-        A, B = held_exponential(by.A, by.B, dt)
-        return replace(self, system=by._replace(A=A, B=B, dt=dt))
+        A, B = held_exponential(system.A, system.B, dt)
+        return replace(self, system=system._replace(A=A, B=B, dt=dt))
 
 
 class OutputFeedback(LinearController):
@@ -365,7 +373,8 @@ def _system_of(given: Any) -> System:
     dt = getattr(given, "dt", None)
     # Continuous systems of SciPy have dt = None and no signal names. In systems of other tools,
     # dt = None means that the sample time is not given.
-    dt = 0.0 if dt is None and not inputs else dt
+    if dt is None and not inputs:
+        dt = 0.0
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
 
 
@@ -377,19 +386,21 @@ def _checked(*given: Any) -> System:
     *matrices, dt, inputs, outputs = System(*given)
     defaults = (), (), (), 0.0
     A, B, C, D = (
-        np.atleast_2d(as_double(f"controller's {key}", default if each is None else each))
-        for key, each, default in zip("ABCD", matrices, defaults, strict=True)
+        np.atleast_2d(as_double(f"controller's {key}", default if matrix is None else matrix))
+        for key, matrix, default in zip("ABCD", matrices, defaults, strict=True)
     )
     nz = len(A) if A.size else 0
-    ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
-    if not nz:
+    if nz:
+        ny, nu = B.shape[-1], len(C)
+        if D.size == 1 and not D.any():
+            D = np.zeros((nu, ny))
+    else:
+        ny, nu = D.shape[-1], len(D)
         A, B, C = np.zeros((0, 0)), np.zeros((0, ny)), np.zeros((nu, 0))
-    elif D.size == 1 and not D.any():
-        D = np.zeros((nu, ny))
     hint = f", for {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
     shapes = (nz, nz), (nz, ny), (nu, nz), (nu, ny)
-    for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
-        shaped(f"{key} of the controller", each, shape, hint)
+    for key, matrix, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
+        shaped(f"{key} of the controller", matrix, shape, hint)
     if dt is not None:
         # A sampled system with unknown sample time has dt = True in python-control and -1 in
         # MATLAB.
@@ -400,19 +411,20 @@ def _checked(*given: Any) -> System:
 def _read(path: Path) -> System:
     check_ending(path, RECORDS)
     with reading(path, "controller"):
-        found, _ = read_record(path)
-        if len(found) == 1 and isinstance(struct := next(iter(found.values())), dict):
-            found = struct  # a MATLAB struct
-        dt = found.get("dt", found.get("Ts"))
-        dt = None if dt is None else float(np.asarray(dt).item())
-        inputs = texts(found.get("input_names", found.get("InputName", ())))
-        outputs = texts(found.get("output_names", found.get("OutputName", ())))
-    A, B, C, D = (found.get(key) for key in "ABCD")
-    given = [each is not None for each in (A, B, C)]
+        entries, _ = read_record(path)
+        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
+            entries = struct  # a MATLAB struct
+        dt = entries.get("dt", entries.get("Ts"))
+        if dt is not None:
+            dt = float(np.asarray(dt).item())
+        inputs = texts(entries.get("input_names", entries.get("InputName", ())))
+        outputs = texts(entries.get("output_names", entries.get("OutputName", ())))
+    A, B, C, D = (entries.get(key) for key in "ABCD")
+    given = [matrix is not None for matrix in (A, B, C)]
     if not all(given) and (any(given) or D is None):
         raise FileError(
-            f"{path}: the file contains {listed(sorted(found)) or 'no arrays'}, expected A, B, C, "
-            "D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
+            f"{path}: the file contains {listed(sorted(entries)) or 'no arrays'}, expected A, B, "
+            "C, D (and Ts if sampled) or D alone; in MATLAB, save the controller K by "
             "[A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
     with located(str(path)):
@@ -420,36 +432,41 @@ def _read(path: Path) -> System:
 
 
 def _indices(
-    kind: str, names: tuple[str, ...], size: int, of: str, known: Sequence[str]
+    kind: str, names: tuple[str, ...], size: int, counterpart: str, known: Sequence[str]
 ) -> list[int]:
     """Return, for each signal of a controller, the index of the same signal in the model."""
     named = not all(map(_NUMBERED.fullmatch, names))
-    if size != len(names if named else known):
+    expected = len(known)
+    count = "no"
+    if named:
+        expected = len(names)
+        count = str(expected)
+    if size != expected:
         raise InputError(
-            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names for "
-            f"them, expected a name for each {kind}, or one {kind} for each {of} of the model: "
-            f"{listed(known)}"
+            f"the controller has {size} {kind}s and {count} names for them, expected a name for "
+            f"each {kind}, or one {kind} for each {counterpart} of the model: {listed(known)}"
         )
     if not named:
         return list(range(size))
-    found = list[int]()
+    indices = list[int]()
     for name in names:
-        index = _index(kind, name, of, known)
-        if index in found:
+        index = _index(kind, name, counterpart, known)
+        if index in indices:
             raise InputError(
                 f"two {kind}s of the controller are named '{name}'; give them different names"
             )
-        found.append(index)
-    return found
+        indices.append(index)
+    return indices
 
 
-def _index(kind: str, name: str, of: str, known: Sequence[str]) -> int:
+def _index(kind: str, name: str, counterpart: str, known: Sequence[str]) -> int:
     """Return the index of a controller's signal among the names `known` of the model."""
     # Names in python-control cannot contain dots, so underscores may replace the dots.
-    fits = [each for each in known if undotted(each) == undotted(name)]
-    fits = [name] if name in fits else fits
+    fits = [candidate for candidate in known if undotted(candidate) == undotted(name)]
+    if name in fits:
+        fits = [name]
     if not fits:
-        text = unknown(f"{of} of the model", name, known)
+        text = unknown(f"{counterpart} of the model", name, known)
         raise InputError(f"{kind} of the controller: {text}; or omit all {kind} names")
     if len(fits) > 1:
         raise InputError(

@@ -296,8 +296,8 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
             "the solution overflows with these weights; give Qp, Qv and Ra with similar magnitudes"
         )
     R = L.T @ (ra[:, None] * L)
-    found = solved(P, K, poles, residual, "closed form")
-    gain = make_gain(whole, lin, found, Q, 0.5 * R + 0.5 * R.T, np.zeros_like(lin.B))
+    solution = solved(P, K, poles, residual, "closed form")
+    gain = make_gain(whole, lin, solution, Q, 0.5 * R + 0.5 * R.T, np.zeros_like(lin.B))
     _caution(gain)
     return gain
 

@@ -151,10 +151,13 @@ def mpc(
     samples = whole("horizon", horizon, 1)
     if sample is not None and dt is not None:
         raise InputError("sample and dt are both given, but dt is the former name of sample")
-    sample = dt if sample is None else sample
-    if sample is None and not lin.dt:
-        raise InputError("sample is missing; give the sampling time [s]")
-    dt = number("sample", lin.dt if sample is None else sample)
+    if sample is None:
+        sample = dt
+    if sample is None:
+        if not lin.dt:
+            raise InputError("sample is missing; give the sampling time [s]")
+        sample = lin.dt
+    dt = number("sample", sample)
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError(
@@ -171,9 +174,9 @@ class _Predictive(Feedback):
     horizon: Horizon
 
     def __repr__(self) -> str:
-        by = self.horizon
-        said = f"{by.samples} samples of {by.dt:g} s, {len(by.limited)} limits"
-        return f"{type(self).__name__}('{by.robot}', {said})"
+        horizon = self.horizon
+        summary = f"{horizon.samples} samples of {horizon.dt:g} s, {len(horizon.limited)} limits"
+        return f"{type(self).__name__}('{horizon.robot}', {summary})"
 
     def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot with the same states and inputs."""
@@ -184,18 +187,18 @@ class _Predictive(Feedback):
 
         About a point, e is the deviation x - x0, and the program does not depend on t.
         """
-        of = self.horizon
+        horizon = self.horizon
         stages = self.horizon.window(max(number("t", t), 0.0))
         nx = len(stages[0].A)
-        size = len(of.inputs) * of.samples
+        size = len(horizon.inputs) * horizon.samples
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
         states, z, limited = condensed(stages, planned=False)
-        (low, high, soft), free = of.bounds(stages), limited[:, size:] @ start
+        (low, high, soft), free = horizon.bounds(stages), limited[:, size:] @ start
         double = 2.0 * z[:, :size].T
         H, g = double @ z[:, :size], double @ (z[:, size:] @ start)
         names = (
-            tuple(f"{name}[{k}]" for k in range(of.samples) for name in names)
-            for names in (of.inputs, of.limited)
+            tuple(f"{name}[{k}]" for k in range(horizon.samples) for name in names)
+            for names in (horizon.inputs, horizon.limited)
         )
         program = (H, g, limited[:, :size], low - free, high - free, soft)
         return Matrices(*program, states[..., size:], states[..., :size], *names)
@@ -231,28 +234,34 @@ class TrajectoryMpc(_Predictive, TrajectoryFeedback):
 
 
 def _unplanned(
-    of: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
+    model: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
 ) -> Horizon:
     """Return a horizon with the limits of a model's signals, but no stages."""
-    if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
+    robot = model.robot if isinstance(model, LinearTrajectory) else model._robot
+    if robot is None:
         raise InputError("lin was loaded from a file, which contains no robot; linearise again")
-    inputs, states, outputs = of.input_names, of.state_names, of.output_names
+    inputs, states, outputs = model.input_names, model.state_names, model.output_names
     beside = [name for name in outputs if name not in states]
-    known = (*state_keys(robot.joint_names), *input_keys(of))
-    found = dict[str, object]()
+    known = (*state_keys(robot.joint_names), *input_keys(model))
+    limit_of = dict[str, object]()
     parts = list(limits) if isinstance(limits, list | tuple) else [limits]
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
-            own = [x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)]
-            ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
-            found |= {beside[i]: limit for i, limit in ranges.items()}
-            parts[k] = {key: limit for key, limit in part.items() if key not in own}
-    end = of.v[-1] if isinstance(of, LinearTrajectory) else of.v
-    acting = chosen_limits(robot, parts[0] if len(parts) == 1 else parts, robot.wheels_at(end))
-    found |= {name: acting[name] for name in states if name in acting}
+            output_keys = [
+                x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)
+            ]
+            ranges = by_name(
+                "output", {key: range_of(key, part[key]) for key in output_keys}, beside
+            )
+            limit_of |= {beside[i]: limit for i, limit in ranges.items()}
+            parts[k] = {key: limit for key, limit in part.items() if key not in output_keys}
+    end = model.v[-1] if isinstance(model, LinearTrajectory) else model.v
+    given = parts[0] if len(parts) == 1 else parts
+    acting = chosen_limits(robot, given, robot.wheels_at(end))
+    limit_of |= {name: acting[name] for name in states if name in acting}
     of_inputs = np.array(input_limits(robot, acting))
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
-    others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
+    others = [limit_of.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
     if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
@@ -276,7 +285,10 @@ def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
     whole = np.hstack((sampled.A, sampled.B))
     with bounded_by("a smaller Qf"):
         K, P, _ = samples_back([(total, whole)] * ahead.samples, end)
-    stages = [ahead.stage(total, whole, *by, lin, lin.u0, lin.x0) for by in zip(K, P, strict=False)]
+    stages = [
+        ahead.stage(total, whole, *gain_and_cost, lin, lin.u0, lin.x0)
+        for gain_and_cost in zip(K, P, strict=False)
+    ]
     far = np.maximum(stages[0].low, -stages[0].high) > 1e-9
     if far.any():
         raise InputError(
@@ -310,11 +322,11 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
         )
         for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
     ]
-    for total, step, K, P, of, u, v in (*designs, last):
+    for total, step, K, P, model, u, v in (*designs, last):
         # The base pose in x is zero, because limits of the base pose apply to the error relative to
         # the trajectory.
-        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(v)))
-        stages.append(ahead.stage(total, step, K, P, of, u, x))
+        x = np.concatenate((np.zeros(6), state.joint_positions(model.q), state.velocities(v)))
+        stages.append(ahead.stage(total, step, K, P, model, u, x))
     stages += stages[-1:] * (ahead.samples - 1)
     return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))
 
@@ -379,14 +391,19 @@ def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Arr
     """
     (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
-    states, efforts, limited = [e], [], []
-    for k, by in enumerate(stages):
-        own = np.eye(nu, size + nx, k * nu)
-        d = by.L @ own - by.K @ e if planned else own
-        efforts.append(own if planned else np.linalg.solve(by.L, own + by.K @ e))
-        e = by.A @ e + by.B @ d
+    states = [e]
+    efforts, limited = list[Array](), list[Array]()
+    for k, stage in enumerate(stages):
+        selector = np.eye(nu, size + nx, k * nu)
+        if planned:
+            d = stage.L @ selector - stage.K @ e
+            efforts.append(selector)
+        else:
+            d = selector
+            efforts.append(np.linalg.solve(stage.L, selector + stage.K @ e))
+        e = stage.A @ e + stage.B @ d
         states.append(e)
-        limited.append(by.E @ e + by.D @ d)
+        limited.append(stage.E @ e + stage.D @ d)
     return np.array(states), np.vstack(efforts), np.vstack(limited)
 
 
@@ -405,7 +422,7 @@ class Horizon:
     high: Array
 
     def stage(
-        self, total: Array, whole: Array, K: Array, P: Array, of: LinearModel, u: Array, x: Array
+        self, total: Array, whole: Array, K: Array, P: Array, lin: LinearModel, u: Array, x: Array
     ) -> Stage:
         """Return the stage of a sample with the gain K.
 
@@ -414,12 +431,12 @@ class Horizon:
         The limits of the stage are relative to the input `u`, the state `x` and the output
         ``of.y0``.
         """
-        (nx, nu), there = of.B.shape, np.concatenate((u, x, of.y0))[self.at]
+        (nx, nu), at_point = lin.B.shape, np.concatenate((u, x, lin.y0))[self.at]
         A, B = np.split(whole, [nx], axis=1)
         L = np.linalg.inv(np.linalg.cholesky(total[nx:, nx:] + B.T @ P @ B)).T
-        E = np.vstack((np.zeros((nu, nx)), np.eye(nx), of.C))[self.at]
-        D = np.vstack((np.eye(nu), np.zeros((nx, nu)), of.D))[self.at]
-        return Stage(A, B, K, L, E, D, self.low - there, self.high - there)
+        E = np.vstack((np.zeros((nu, nx)), np.eye(nx), lin.C))[self.at]
+        D = np.vstack((np.eye(nu), np.zeros((nx, nu)), lin.D))[self.at]
+        return Stage(A, B, K, L, E, D, self.low - at_point, self.high - at_point)
 
     def window(self, t: float) -> tuple[Stage, ...]:
         """Return the N stages from time t on, or the last N stages if fewer remain."""
@@ -429,7 +446,7 @@ class Horizon:
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
         """Return the lower limits, the upper limits and a mask of the soft limits of all stages."""
         soft = np.tile(self.at >= len(self.inputs), len(stages))
-        low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
+        low, high = (np.concatenate([stage[i] for stage in stages]) for i in (-2, -1))
         return low, high, soft
 
 
@@ -456,18 +473,21 @@ class Receding(BoundLaw):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the run: number of plans, violations of soft limits, and solver failures."""
-        said = (
+        message = (
             f"number of MPC plans, each of {self.of.samples} samples of {self.of.dt:g} s: "
             f"{self.solves}"
         )
-        for what, (count, _, worst) in self._violations.items():
-            said += f"; {what} a soft limit: {count} (worst: {worst})" if count else ""
+        for event, (count, _, worst) in self._violations.items():
+            if count:
+                message += f"; {event} a soft limit: {count} (worst: {worst})"
         if self.unfinished:
-            said += (
+            message += (
                 "; plans without a solution, replaced by the saturated LQR command: "
                 f"{self.unfinished}"
             )
-        return (said,) if self.solves else ()
+        if not self.solves:
+            return ()
+        return (message,)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) at a sample."""
@@ -491,9 +511,9 @@ class Receding(BoundLaw):
         if self._due:
             # Check the soft limits at the end of the last sample. The robot may exceed a limit even
             # if the plan does not, because the robot differs from the model.
-            by, last = self._due
-            reached, width = by.E @ e + by.D @ last, by.high - by.low
-            excess = np.maximum(by.low - reached, reached - by.high)
+            previous, last = self._due
+            reached, width = previous.E @ e + previous.D @ last, previous.high - previous.low
+            excess = np.maximum(previous.low - reached, reached - previous.high)
             width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
             self._record(_OF_ROBOT, t - self.of.dt, excess, 1.0 / width, _OVER)
         z, flag = self._solved(free)
@@ -522,20 +542,20 @@ class Receding(BoundLaw):
         self._due = now, d
         return d
 
-    def _record(self, what: str, t: float, excess: Array, unit: Array, least: float) -> None:
+    def _record(self, event: str, t: float, excess: Array, unit: Array, least: float) -> None:
         """Count a plan or sample that violates a soft limit, and record the largest violation.
 
         A soft limit is violated if its entry of ``excess * unit`` is larger than `least`. The
         entries are ordered by sample, and the first sample starts at time t [s].
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
-        row, (count, most, said) = int(fractions.argmax()), self._violations[what]
+        row, (count, most, description) = int(fractions.argmax()), self._violations[event]
         if fractions[row] > max(most, least):
             sample, at = divmod(row, len(self.of.limited))
             most = float(fractions[row])
             when = t + (sample + 1) * self.of.dt
-            said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
-        self._violations[what] = count + bool(fractions[row] > least), most, said
+            description = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+        self._violations[event] = count + bool(fractions[row] > least), most, description
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         self._stages = stages
@@ -549,7 +569,9 @@ class Receding(BoundLaw):
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit
         width = width[np.isfinite(width)]
-        self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
+        self._size = 1.0
+        if len(width):
+            self._size = float(np.median(width)) or 1.0
         self._rows = self._G * self._unit[:, None]
 
     def _start(self) -> None:

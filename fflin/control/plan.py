@@ -153,9 +153,7 @@ def plan(
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    ends = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
-    x, q, v = (None, *ends) if isinstance(ends, tuple) and len(ends) == 2 else (ends, None, None)
-    end = points.point_of(state, x, q, v, lambda: (robot.neutral(), np.zeros(robot.nv)))
+    end = _goal_point(state, goal)
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)
     if not 1e-9 < duration < 1e9:
         raise InputError(f"duration is {duration:g} s, expected a positive time")
@@ -184,13 +182,8 @@ def plan(
     _require_within(shooting, bounds, "goal", end, asked)
     # NumPy's warnings are not needed, because an error is raised if the search diverges.
     with np.errstate(all="ignore"), closing(Progress(progress)) as line:
-        # Weights of the knots in the integral of the effort: the hold times if the inputs are held,
-        # otherwise the weights of the trapezoidal rule.
-        h = shooting.h
         inputs = np.array((low, high))
-        held = np.append(h, h[-1] if shooting.held else 0.0)
-        held = held if shooting.held else 0.5 * (held + held[::-1])
-        cost = held[:, None] * weights
+        cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
         search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
@@ -226,6 +219,35 @@ class _Made(NamedTuple):
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
 
 
+def _goal_point(
+    state: StateMap, goal: LinearModel | tuple[ArrayLike | None, ArrayLike | None] | ArrayLike
+) -> Point:
+    """Return q (nq,) and v (nv,) of a goal: the point of a model, (q, v), or a state x (nx,)."""
+    robot = state.robot
+
+    def at_rest() -> Point:
+        return robot.neutral(), np.zeros(robot.nv)
+
+    if isinstance(goal, LinearModel):
+        return points.point_of(state, None, goal.q, goal.v, at_rest)
+    if isinstance(goal, tuple) and len(goal) == 2:
+        return points.point_of(state, None, *goal, at_rest)
+    return points.point_of(state, goal, None, None, at_rest)
+
+
+def _knot_weights(shooting: Shooting) -> Array:
+    """Return the weight [s] of each knot in the integral of the effort over time.
+
+    If the inputs are held, the weights are the hold times, otherwise those of the trapezoidal rule.
+    """
+    h = shooting.h
+    if shooting.held:
+        return np.append(h, h[-1])
+    padded = np.append(h, 0.0)
+    weights: Array = 0.5 * (padded + padded[::-1])
+    return weights
+
+
 def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
@@ -237,12 +259,15 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     shooting = search.shooting
     bounds = search.bounds
     cost = search.cost
-    found = list[_Made]()
+    attempts = list[_Made]()
     unit = float((cost * guess[2] ** 2).sum() or cost.sum())
     cost = cost / unit  # cost * u**2 of the guess sums to 1
     # The first attempt has limits between the knots. If it misses the goal, or exceeds a limit by
     # more than the tolerance, a second attempt has limits at the knots only.
-    for parts in (_PARTS, 1) if np.isfinite(bounds).any() else (1,):
+    divisions = [1]
+    if np.isfinite(bounds).any():
+        divisions = [_PARTS, 1]
+    for parts in divisions:
         (q, v, u, *_), optimality = search._replace(cost=cost, parts=parts).best(*guess)
         if optimality is not None:
             optimality = replace(optimality, effort=unit * optimality.effort)
@@ -253,14 +278,14 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        found.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
-        if found[-1].reached and found[-1].most <= _BETWEEN:
+        attempts.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
+        if attempts[-1].reached and attempts[-1].most <= _BETWEEN:
             break
-    return max(found, key=lambda made: (made.reached, -made.most))
+    return max(attempts, key=lambda made: (made.reached, -made.most))
 
 
 def _require_within(
-    shooting: Shooting, bounds: Array, what: str, point: Point, asked: Mask
+    shooting: Shooting, bounds: Array, which_end: str, point: Point, asked: Mask
 ) -> None:
     """Raise `InputError` if a state of a point is outside its limits.
 
@@ -275,7 +300,7 @@ def _require_within(
         if asked[i] and side * (values[i] - limit) > _REACHED
     ]
     if outside:
-        raise InputError(f"the {what} is outside the limits: {listed(outside)}")
+        raise InputError(f"the {which_end} is outside the limits: {listed(outside)}")
 
 
 def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
@@ -283,7 +308,7 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     names = [f"the attitude about {axis}" for axis in "xyz"] + [*state.names[3:]]
-    by = [
+    misses = [
         f"{words} {names[i]} by {far[i]:.3g} {units[i]}"
         for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
         for i in np.argsort(-far)[:3]
@@ -301,16 +326,17 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
             "moves the base"
         )
     elif asked[state.groups.q_b].any() and all(
-        isinstance(each, JointTorque) for each in robot.inputs
+        isinstance(actuator, JointTorque) for actuator in robot.inputs
     ):
         advice = (
             "joint torques alone rotate the base only if the joints move in loops (the system is "
             "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
             "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
+    outcome = listed(misses) if misses else "diverges"
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
-        f"last trial {listed(by) if by else 'diverges'}; {advice}"
+        f"last trial {outcome}; {advice}"
     )
 
 
@@ -352,11 +378,13 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
     names, units = state.names + input_keys(actuation), state.units + actuation.units
     bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
     shares = np.abs(values) / np.where(bound > 0.0, bound, np.inf)
-    found: dict[tuple[str, bool], tuple[float, str]] = {}
+    nearest: dict[tuple[str, bool], tuple[float, str]] = {}
     for i in np.flatnonzero(np.isfinite(limits).any(axis=0)):
         k = int(shares[:, i].argmax())
-        said = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
+        text = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
         group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
-        found[group] = max(found.get(group, (0.0, said)), (float(shares[k, i]), said))
-    said = ", ".join(said.replace(" ", "\u00a0") for _, said in found.values())
-    return f"\nnearest to their limits at the knots: {said}" if said else ""
+        nearest[group] = max(nearest.get(group, (0.0, text)), (float(shares[k, i]), text))
+    text = ", ".join(text.replace(" ", "\u00a0") for _, text in nearest.values())
+    if not text:
+        return ""
+    return f"\nnearest to their limits at the knots: {text}"

@@ -87,9 +87,9 @@ def plot_matrices(
             for first, *_ in runs(lin.state_names, lin.state_units)[1:]:
                 ax.axhline(first - 0.5, color="#888888", lw=0.6)
         panel[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
-        of = "row" if lin.dt else "row's rate"
+        row_label = "row" if lin.dt else "row's rate"
         figure.colorbar(image, ax=panel, shrink=0.8).set_label(
-            f"magnitude, in SI units of the {of} per unit of the column"
+            f"magnitude, in SI units of the {row_label} per unit of the column"
         )
         time = f", sampled every {lin.dt:g} s" if lin.dt else ""
         figure.suptitle(f"{lin.robot}, frame {lin.frame}{time}")
@@ -146,8 +146,10 @@ def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | Non
         panel.set_yticks(range(count), labels, fontsize=8)
         panel.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
         patches = [Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()]
-        said = "largest entry: 1; outline: modulus of an entry out of phase"
-        figure.legend(handles=patches, title=said, loc="outside lower center", ncols=len(colors))
+        legend_title = "largest entry: 1; outline: modulus of an entry out of phase"
+        figure.legend(
+            handles=patches, title=legend_title, loc="outside lower center", ncols=len(colors)
+        )
         figure.suptitle(title)
     return figure
 
@@ -189,8 +191,10 @@ def plot_check(check: Check, path: str | Path | None = None, *, axes: Axes | Non
     instance("check", check, Check, "a Check, as fflin.check returns")
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
-    own = ("ABA derivatives", "differences")
-    labels = {row: row.block if row.test in own else f"{row.test}: {row.block}" for row in rows}
+    main_tests = ("ABA derivatives", "differences")
+    labels = {
+        row: row.block if row.test in main_tests else f"{row.test}: {row.block}" for row in rows
+    }
     names = list(dict.fromkeys(labels.values()))
     with drawing(path, 7.5, 2.2 + 0.2 * len(names), axes=axes) as figure:
         panel = figure.add_subplot()
@@ -250,11 +254,11 @@ def plot_poles(
     """
     dt = number("dt", dt)
     sets = poles if isinstance(poles, dict) and poles else {"": poles}
-    found = {str(label): _poles_of(given) for label, given in sets.items()}
-    dt = next((own for _, own in found.values() if own), dt)
+    pole_sets = {str(label): _poles_of(given) for label, given in sets.items()}
+    dt = next((given_dt for _, given_dt in pole_sets.values() if given_dt), dt)
     with drawing(path, 6.0, 5.0, axes=axes) as figure:
         panel = figure.add_subplot()
-        _pole_map(panel, {label: values for label, (values, _) in found.items()}, dt)
+        _pole_map(panel, {label: values for label, (values, _) in pole_sets.items()}, dt)
         panel.set_title(title)
         if any(sets):
             figure.legend(loc="outside lower center", ncols=4)
@@ -292,17 +296,21 @@ def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None 
             for name, loop in zip(gain.input_names, loops, strict=True)
         )
         lines = sizes.get_lines()[: len(loops)]
-        said = "margins at each input: phase, gain factors"
+        legend_title = "margins at each input: phase, gain factors"
         letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
-        figure.legend(lines, names, title=said, loc="outside right upper", fontsize=letters)
-        # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
-        rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
+        figure.legend(lines, names, title=legend_title, loc="outside right upper", fontsize=letters)
+        rates, title, time = gain.poles, "poles of A - B K", ""
+        if gain.dt:
+            # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
+            rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt
+            title = "poles of A - B K as ln(z)/dt"
+            time = f", sampled at {gain.dt:g} s"
         _pole_map(poles, {"": rates}, 0.0)
-        poles.set_title("poles of A - B K as ln(z)/dt" if gain.dt else "poles of A - B K")
+        poles.set_title(title)
         low, high = gain.margins.gain
         figure.suptitle(
-            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: open loop at each "
-            "input, with the loops of all other inputs closed\nmargins for simultaneous "
+            f"{gain.robot}{time}: open loop at each input, with the loops of all other inputs "
+            "closed\nmargins for simultaneous "
             f"changes: phase {gain.margins.phase:.3g} deg, gain {low:.2g} to {high:.3g} (disk "
             f"margin {gain.margins.disk:.3g})",
             x=0.02,
@@ -327,8 +335,11 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         with np.errstate(divide="ignore", invalid="ignore"):
             return T / (1.0 - T)
 
-    rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt if dt else gain.poles)
-    end = math.pi / dt if dt else 100.0 * float(rates.max())
+    rates = np.abs(gain.poles)
+    end = 100.0 * float(rates.max())
+    if dt:
+        rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt)
+        end = math.pi / dt
     grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
 
@@ -341,13 +352,17 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
 
         signs = np.signbit(value(values[:, i]))
         at = np.flatnonzero((signs[1:] != signs[:-1]) & among[1:] & among[:-1])
-        found = (brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12) for k in at)
-        return [complex(response(w)[i]) for w in found]
+        frequencies = (
+            brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12) for k in at
+        )
+        return [complex(response(w)[i]) for w in frequencies]
 
     loops = []
     # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real. Its
     # phase may be -180 deg there, without a change of sign of the imaginary part.
-    ends = [response(0.0)] + [values[-1]] * bool(dt)
+    ends = [response(0.0)]
+    if dt:
+        ends.append(values[-1])
     for i in range(len(K)):
         crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
         turned = changes(np.imag, i, values[:, i].real < 0.0)
@@ -393,8 +408,8 @@ def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
         unit = float(np.abs(every).max(initial=0.0))
         logarithmic(axes, "x", every.real, unit)
         logarithmic(axes, "y", every.imag, unit)
-    of = "" if dt else " [1/s]"
-    axes.set(xlabel=f"real part{of}", ylabel=f"imaginary part{of}")
+    unit_label = "" if dt else " [1/s]"
+    axes.set(xlabel=f"real part{unit_label}", ylabel=f"imaginary part{unit_label}")
 
 
 def _poles_of(given: object) -> tuple[Values, float]:

@@ -329,10 +329,11 @@ class AllocatedPolicy(BoundLaw):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on a run: how the commands are realised, and the notes of the inner policy."""
-        asked, given = (", ".join(each.groups) for each in (self._design, self._robot))
-        said = f"allocation: the commanded {asked} are realised by {given}"
         notes = self._inner.notes if self._inner else ()
-        return notes if self._design.names == self._robot.names else (said, *notes)
+        if self._design.names == self._robot.names:
+            return notes
+        asked, given = (", ".join(actuation.groups) for actuation in (self._design, self._robot))
+        return (f"allocation: the commanded {asked} are realised by {given}", *notes)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
@@ -371,17 +372,17 @@ def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
     the state vector, and the indices of the gyroscope rates follow. Other sensors raise
     `InputError`.
     """
-    found, gyros = list[int](), list[Gyroscope]()
+    indices, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
         if isinstance(output, Gyroscope):
             first = state.nx + 3 * len(gyros)
-            found += range(first, first + 3)
+            indices += range(first, first + 3)
             gyros.append(output)
         elif type(output) in KINDS:
             raise InputError(f"a {type(output).__name__} is measured in Python")
         else:
-            found += state_indices(state, output)
-    return found, gyros
+            indices += state_indices(state, output)
+    return indices, gyros
 
 
 # Function of the command u that returns the outputs y.
@@ -437,8 +438,9 @@ class Loop(BoundLaw):
         self.stages = 0
         self._last = -np.inf
         self._at_rest: Array = np.zeros(state.robot.nv)
-        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba = Aba(state) if felt else None
+        self._aba: Aba | None = None
+        if any(output.FEELS_ACCELERATION for output in state.robot.outputs):
+            self._aba = Aba(state)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or at a stage of the integrator."""

@@ -145,7 +145,9 @@ class Policy(ABC):
     @property
     def sample_time(self) -> float:
         """Sampling time [s]; 0 for continuous commands."""
-        return 0.0 if self.model is None else self.model.dt
+        if self.model is None:
+            return 0.0
+        return self.model.dt
 
     @property
     def measurement_noise(self) -> Noise | None:
@@ -201,7 +203,9 @@ class Policy(ABC):
             return ()
         names = self.model.state_names
         K = self.feedback_gain
-        return names if K is None else states_of_gain(names, K)
+        if K is None:
+            return names
+        return states_of_gain(names, K)
 
     def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
         """Return the reference inputs at the start, or None if the law has none.
@@ -209,12 +213,16 @@ class Policy(ABC):
         `names` are the inputs of the robot. An allocation commands others.
         """
         lin = self.model
-        return lin.u0 if lin is not None and lin.input_names == names else None
+        if lin is None or lin.input_names != names:
+            return None
+        return lin.u0
 
     def reference_inputs(self, names: tuple[str, ...]) -> tuple[str, Array] | None:
         """Return where the law has reference inputs, and these inputs (N, nu), or None."""
         initial = self.initial_inputs_for(names)
-        return None if initial is None else ("at its target", initial[None])
+        if initial is None:
+            return None
+        return "at its target", initial[None]
 
     def held_for(self, seconds: float) -> Policy:
         """Return the law for commands that are held for some seconds."""
@@ -232,7 +240,9 @@ class Policy(ABC):
         """Return the matrix of the linear closed loop and its dt [s], or None if it has none."""
         lin = self.model
         K = self.feedback_gain
-        return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt)
+        if lin is None or K is None:
+            return None
+        return lin.A - lin.B @ K, lin.dt
 
     def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
         """Return a function from a sampled model to the matrix of its closed loop, or None.
@@ -240,7 +250,9 @@ class Policy(ABC):
         `sample` is the sampling time [s].
         """
         K = self.feedback_gain
-        return None if K is None else lambda model: model.A - model.B @ K
+        if K is None:
+            return None
+        return lambda model: model.A - model.B @ K
 
     def poles_along(self) -> Array:
         """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""
@@ -340,7 +352,9 @@ class FunctionPolicy(Policy):
 
 def as_policy(given: object) -> Policy:
     """Return a policy; raise `InputError` if the object is neither a policy nor a function."""
-    return given if isinstance(given, Policy) else FunctionPolicy(given)
+    if isinstance(given, Policy):
+        return given
+    return FunctionPolicy(given)
 
 
 def bound(policy: object, robot: Robot) -> Command:

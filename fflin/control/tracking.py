@@ -156,8 +156,9 @@ class TrajectoryFeedback(Feedback):
     @property
     def over(self) -> float:
         """Time [s] after which the command holds the robot at the end of the trajectory."""
-        held = self.held or self.schedule.dt
-        return self.duration * (2.0 - AT_THE_END if held else AT_THE_END)
+        if self.held or self.schedule.dt:
+            return self.duration * (2.0 - AT_THE_END)
+        return self.duration * AT_THE_END
 
     @property
     def jumps(self) -> bool:
@@ -167,7 +168,9 @@ class TrajectoryFeedback(Feedback):
     @property
     def ahead(self) -> float:
         """Time [s] after a sample at which the reference input equals its mean over the sample."""
-        return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
+        if self.trajectory.hold == "linear":
+            return 0.5 * self.schedule.dt
+        return 0.0
 
     def commanded(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, u of the trajectory point to which the command at run time t refers."""
@@ -181,8 +184,10 @@ class TrajectoryFeedback(Feedback):
     @cached_property
     def end_gain(self) -> Array:
         """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
-        by = self.schedule
-        return steady_regulator(SteadyEnd(self.end, np.zeros(3)), by.Q, by.R, by.dt)[1]
+        schedule = self.schedule
+        return steady_regulator(
+            SteadyEnd(self.end, np.zeros(3)), schedule.Q, schedule.R, schedule.dt
+        )[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
         """Return q (nq,) and v (nv,) displaced from the initial state of the trajectory.
@@ -215,7 +220,9 @@ class TrajectoryFeedback(Feedback):
             )
         if angles.any():
             turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
-            e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
+            if turn[3] < 0.0:
+                turn = -turn
+            e[:3] = turn[:3]
         return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:
@@ -228,10 +235,10 @@ class TrajectoryFeedback(Feedback):
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
-        state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
+        state, design_state = StateMap(robot, frame="local"), StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
         for kind in ("input", "state"):
-            require_same(made, state, kind, *signals_of(own, kind))
+            require_same(made, state, kind, *signals_of(design_state, kind))
         require_turns(made, origin.nq, robot)
         return state
 
@@ -347,17 +354,17 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         origin = self.trajectory.robot
         home = self.state_map(robot)
         made = f"the trajectory was made for '{origin.name}'"
-        own = signals_of(StateMap(origin, frame="local"), "output")
-        require_same(made, home, "output", *own)
+        design_outputs = signals_of(StateMap(origin, frame="local"), "output")
+        require_same(made, home, "output", *design_outputs)
 
-        def there(t: float) -> tuple[Measuring, Array]:
+        def expected_at(t: float) -> tuple[Measuring, Array]:
             q, v, _ = self.reference(t)
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
         dt = self.filter.dt
         sizes = self.filter.L.shape[1:]
-        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *there(t)), self.noise)
+        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise)
 
     @property
     def measurement_noise(self) -> Noise | None:

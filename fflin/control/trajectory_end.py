@@ -59,8 +59,8 @@ class SteadyEnd(NamedTuple):
             return lin
         back = 2.0 * np.eye(len(T)) - T  # the inverse, because (T - I)^2 = 0
         outputs = Linearizer(robot, moving=True)(lin.q, self.v, lin.u0)
-        own = {name: getattr(outputs, name) for name in ("C", "D", "y0")}
-        return replace(lin, A=back @ lin.A @ T, B=back @ lin.B, **own)
+        output_fields = {name: getattr(outputs, name) for name in ("C", "D", "y0")}
+        return replace(lin, A=back @ lin.A @ T, B=back @ lin.B, **output_fields)
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
@@ -71,7 +71,9 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
     rest relative to axes that fall with its centre of mass.
     """
     lin = traj[end]
-    return SteadyEnd(lin, np.zeros(3)) if lin.is_equilibrium() else rest_or_fall(traj, end)
+    if lin.is_equilibrium():
+        return SteadyEnd(lin, np.zeros(3))
+    return rest_or_fall(traj, end)
 
 
 def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
@@ -81,7 +83,9 @@ def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
     except EquilibriumError as error:
         if _falls(traj, end):
             return _falling_end(traj, end)
-        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
+        where, given = "start", "P0"
+        if end:
+            where, given = "end", "Q, R and Qf"
         raise EquilibriumError(
             f"no inputs hold the robot at the {where} of the trajectory: {error}; give {given}"
         ) from None

@@ -44,9 +44,12 @@ class Schedule(ModelDesign):
     @cached_property
     def starts(self) -> list[float]:
         """Start times of the intervals between knots, or of the samples of a sampled schedule."""
-        # A sample starts slightly before its nominal time, so that a rounded time finds its sample.
-        late = np.append(self.t[0], self.t[1:] - 1e-9 * self.dt)
-        starts: list[float] = (late if self.dt else self.t[:-1]).tolist()
+        times = self.t[:-1]
+        if self.dt:
+            # A sample starts slightly before its nominal time, so that a rounded time finds its
+            # sample.
+            times = np.append(self.t[0], self.t[1:] - 1e-9 * self.dt)
+        starts: list[float] = times.tolist()
         return starts
 
     def interval(self, t: float) -> int:
@@ -432,4 +435,6 @@ def sample_time(traj: LinearTrajectory, sample: float | None) -> float:
     expected = "a LinearTrajectory; fflin.linearize_trajectory returns one"
     if instance("traj", traj, LinearTrajectory, expected).dt:
         raise InputError("traj is sampled; give the continuous trajectory and sample=")
-    return 0.0 if sample is None else number("sample", sample)
+    if sample is None:
+        return 0.0
+    return number("sample", sample)

@@ -93,13 +93,13 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
     keys = (*lin.state_names, *input_keys(lin))
-    found = {index for name in largest for index in matching("state or input", name, keys)}
-    if len({index < len(lin.state_names) for index in found}) > 1:
+    indices = {index for name in largest for index in matching("state or input", name, keys)}
+    if len({index < len(lin.state_names) for index in indices}) > 1:
         raise InputError(
             f"largest has states and inputs ({', '.join(map(repr, largest))}); call bryson once "
             "for the states and once for the inputs"
         )
-    of_inputs = min(found) >= len(lin.state_names)
+    of_inputs = min(indices) >= len(lin.state_names)
     names = input_keys(lin) if of_inputs else lin.state_names
     sizes = numbers("largest", largest, "name", "largest value of")
     for key, size in sizes.items():
@@ -165,18 +165,18 @@ def require_semidefinite(
 
 
 def cost_weights(
-    of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
+    model: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
     """Check the weights Q, R and N, and return them as matrices; N is zero by default."""
-    Q = weight("Q", Q, of.state_names)
-    R = weight("R", R, input_keys(of), definite=True)
+    Q = weight("Q", Q, model.state_names)
+    R = weight("R", R, input_keys(model), definite=True)
     cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
     if cross.any():
         with np.errstate(over="ignore", invalid="ignore"):
             reduced = Q - cross @ np.linalg.solve(R, cross.T)
         if not np.isfinite(reduced).all():
             raise InputError("N R^-1 N' overflows; give a smaller N or a larger R")
-        require_semidefinite("Q - N R^-1 N'", reduced, of.state_names, _ROUNDING)
+        require_semidefinite("Q - N R^-1 N'", reduced, model.state_names, _ROUNDING)
     return Q, R, cross
 
 
@@ -258,13 +258,13 @@ def _diagonal(
     what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
 ) -> Array:
     checked = numbers(what, values, "name", "weight of")
-    found = by_name(f"entry of {what}", checked, names)
-    if complete and len(found) < len(names):
-        missing = next(name for index, name in enumerate(names) if index not in found)
+    value_at = by_name(f"entry of {what}", checked, names)
+    if complete and len(value_at) < len(names):
+        missing = next(name for index, name in enumerate(names) if index not in value_at)
         raise InputError(
             f"{what} has no value for {missing}; give a value for every entry of {what}"
         )
-    return np.array([found.get(index, 0.0) for index in range(len(names))])
+    return np.array([value_at.get(index, 0.0) for index in range(len(names))])
 
 
 def rule_weights(
@@ -279,10 +279,11 @@ def rule_weights(
     # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
     # the robot names a rule, the rule is "urdf".
     source = lin.generator or lin
-    given = given if isinstance(given, Mapping) else {"rule": given}
+    if not isinstance(given, Mapping):
+        given = {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson"))
-    own = lin.weights if given.get("rule") is None else {}
-    name = own.get("rule", given.get("rule"))
+    robot_weights = lin.weights if given.get("rule") is None else {}
+    name = robot_weights.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(lin.B.shape))
     if name is None or name == "urdf":
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
@@ -293,13 +294,15 @@ def rule_weights(
         rule = "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
-    if weights := _weights_of(lin, own, of_robot=True) | _weights_of(lin, given):
+    if weights := _weights_of(lin, robot_weights, of_robot=True) | _weights_of(lin, given):
         # By Bryson's rule, each signal with a largest value from the user costs 1 at this value.
         # To match this scale, Q and R of the rule are multiplied by a common factor, which does not
         # change the gain of the rule. With this factor, the geometric mean of the costs of the same
         # signals is 1 at the largest values of the rule.
         costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
-        scale = math.exp(-np.log(costs).mean()) if costs else 1.0
+        scale = 1.0
+        if costs:
+            scale = math.exp(-np.log(costs).mean())
         Q, R = scale * Q, scale * R
         for index, (value, *_) in weights.items():
             matrix, at = (Q, index) if index < len(Q) else (R, index - len(Q))
@@ -308,7 +311,8 @@ def rule_weights(
             matrix[at, at] = value
         named = dict.fromkeys(key for _, key, _ in weights.values())
         rule = f"{', '.join(named)} as given; all other weights: {rule}"
-        rule += " (these figures are for this rule alone)" if terms.any() else ""
+        if terms.any():
+            rule += " (these figures are for this rule alone)"
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
@@ -334,7 +338,9 @@ def _of_regulated(
     """
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
-    body = lin if part is lin else regulated_part(without(lin, wheels))
+    body = lin
+    if part is not lin:
+        body = regulated_part(without(lin, wheels))
     at = _limited_wheels(lin, wheels)
     names = [lin.state_names[i + len(lin.M)] for i in at]
     spin = np.abs(lin.x0[at + len(lin.M)])
@@ -372,7 +378,7 @@ def _weights_of(
     """Return {index: given weight}. The indices of the inputs follow the indices of the states."""
     states = lin.state_names
     inputs = input_keys(lin)
-    found = dict[int, _Given]()
+    given_weights = dict[int, _Given]()
     every = (*states, *inputs)
     kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
     for part, kind, known in kinds:
@@ -380,17 +386,20 @@ def _weights_of(
         for key, value in numbers(part, given.get(part, {}), "name", f"{part} of").items():
             if of_robot and not stands_for_any(key, known):
                 continue  # a reduced model may lack states that the robot's weights name
-            what = f"largest value of '{key}' (--bryson)"
+            label = f"largest value of '{key}' (--bryson)"
             largest = part == "bryson"
             if largest and key.startswith("q_b"):
-                require_chart(what, value)
-            values[key] = inverse_square(what, value) if largest else value, key, largest
+                require_chart(label, value)
+            cost = value
+            if largest:
+                cost = inverse_square(label, value)
+            values[key] = cost, key, largest
         first = len(states) if part == "r" else 0
         at = {first + i: x for i, x in by_name(kind, values, known).items()}
-        if both := found.keys() & at.keys():
+        if both := given_weights.keys() & at.keys():
             raise InputError(
                 f"'{every[min(both)]}' has both a weight and a largest value "
                 "(bryson); give only one of them"
             )
-        found |= at
-    return found
+        given_weights |= at
+    return given_weights

@@ -15,8 +15,8 @@ def scaled_inverse(matrix: Array) -> Array:
     Without the scaling, a matrix of coordinates of very different inertia would lose digits.
     """
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
-    found: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
-    return found
+    inverse: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
+    return inverse
 
 
 class Aba:
@@ -47,10 +47,14 @@ class Aba:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
-        absolute = self.field.absolute(q, v) if self.field else v
+        absolute = v
+        if self.field:
+            absolute = self.field.absolute(q, v)
         wrenches = self._wrenches(q, absolute, u)
         rate = self._accelerate(self._model, q, absolute, forces, wrenches)
-        return self.field.relative(v, absolute, rate) if self.field else rate
+        if self.field:
+            return self.field.relative(v, absolute, rate)
+        return rate
 
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
         """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
@@ -61,11 +65,11 @@ class Aba:
         if self._resists:
             forces += self._passive_force(q, v)
         tau = state.lift(forces.T).T
-        found = np.empty_like(v)
+        rates = np.empty_like(v)
         for k, point in enumerate(zip(q, v, tau, strict=True)):
             wrenches = self.actuation.wrenches(u[k]) or self._none
-            found[k] = pin.aba(self._model, self._data, *point, wrenches)
-        return found
+            rates[k] = pin.aba(self._model, self._data, *point, wrenches)
+        return rates
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms.
@@ -93,7 +97,7 @@ class Aba:
         stiffness, damping, _ = state.robot.springs
         tau = state.lift(self.actuation.fixed @ u + self._passive_force(q, v))
         field = self.field
-        here = q, v
+        given_point = q, v
         if field:
             q, v = field.near(q, v)
         external = self._wrenches(q, v, u)
@@ -121,7 +125,7 @@ class Aba:
         if field:
             pin.computeJointJacobians(self._model, self._data, q)
             by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
-            field.add_turning(*here, by_q, by_v)
+            field.add_turning(*given_point, by_q, by_v)
         by_u = []
         for unit, forces in zip(np.eye(len(u)), self.actuation.fixed.T, strict=True):
             wrenches = self.actuation.wrenches(unit) or self._none
@@ -141,8 +145,9 @@ class Aba:
         for joint, momentum in stored:
             torque = -np.cross(self._data.v[joint].angular, momentum)
             total[joint] += pin.Force(np.zeros(3), torque)
-        for joint, pull in enumerate(self.field.wrenches(self._data) if self.field else ()):
-            total[joint] += pull
+        if self.field:
+            for joint, pull in enumerate(self.field.wrenches(self._data)):
+                total[joint] += pull
         return total
 
     def _passive_force(self, q: Array, v: Array) -> Array:

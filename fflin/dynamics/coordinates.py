@@ -55,11 +55,12 @@ def frame_of(robot: Robot, frame: object) -> Frame:
     if not isinstance(frame, str) or frame not in get_args(Frame):
         raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
     if (frame in ORBITAL) != bool(robot.orbit):
-        suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
-        raise InputError(
-            f"frame is '{frame}', but '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
-            f"use {suits}{'' if robot.orbit else ', or give the robot an orbit (orbit=, --orbit)'}"
-        )
+        where = "in no orbit"
+        remedy = "use hybrid, local or world, or give the robot an orbit (orbit=, --orbit)"
+        if robot.orbit:
+            where = "in an orbit"
+            remedy = f"use {' or '.join(ORBITAL)}"
+        raise InputError(f"frame is '{frame}', but '{robot.name}' is {where}; {remedy}")
     return cast("Frame", frame)
 
 
@@ -132,7 +133,8 @@ class Chart:
     def of(cls, quaternion: Array) -> Chart:
         """Return the chart at unit quaternions (.., 4) of refMb, each of arbitrary sign."""
         if quaternion.ndim == 1:
-            quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
+            if quaternion[3] < 0.0:
+                quaternion = -quaternion
             return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
         quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
         return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
@@ -150,11 +152,15 @@ class Chart:
 
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt (.., 3) for the angular velocity omega (.., 3) in base axes (1.2)."""
-        return 0.5 * omega if self.standing else times(self.N, omega)
+        if self.standing:
+            return 0.5 * omega
+        return times(self.N, omega)
 
     def turned(self, columns: Array) -> Array:
         """Convert k vectors, the columns of an array (.., 3, k), from base to reference axes."""
-        return columns if self.standing else product(self.R, columns)
+        if self.standing:
+            return columns
+        return product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of d q_b/dt with respect to q_b (4.2).
@@ -171,7 +177,9 @@ class Chart:
         `by_turn` (.., k, 3) contains the derivatives with respect to d theta, a small rotation of
         the base in base axes (1.3).
         """
-        return 2.0 * by_turn if self.standing else product(by_turn, self.J)
+        if self.standing:
+            return 2.0 * by_turn
+        return product(by_turn, self.J)
 
     def turn_rows(self, parts: tuple[slice, ...], x: Array) -> None:
         """Multiply blocks of three rows of x (.., m, k) by R from the left, in place.
@@ -179,7 +187,8 @@ class Chart:
         `parts` has one slice of three rows for each block. To multiply blocks of three columns of a
         matrix by R^T from the right, pass the transpose of this matrix as x.
         """
-        _turn(self.R, () if self.standing else parts, x)
+        if not self.standing:
+            _turn(self.R, parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some rows converted from base axes to reference axes.
@@ -187,7 +196,9 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        return x if self.standing or not parts else _turn(self.R, parts, x.copy("K"))
+        if self.standing or not parts:
+            return x
+        return _turn(self.R, parts, x.copy("K"))
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some rows converted from reference axes to base axes.
@@ -195,7 +206,9 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        return x if self.standing or not parts else _turn(self.R.mT, parts, x.copy("K"))
+        if self.standing or not parts:
+            return x
+        return _turn(self.R.mT, parts, x.copy("K"))
 
 
 class Standing(Chart):
@@ -339,8 +352,7 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
     """
     at, to = x[:, :3], target[..., :3]
     w, d = (
-        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
-        for each in (at, to)
+        np.sqrt(np.maximum(0.0, 1.0 - (q_b * q_b).sum(axis=-1, keepdims=True))) for q_b in (at, to)
     )
     return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(axis=-1, keepdims=True)
 
@@ -375,8 +387,8 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
     x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
     R = R_target @ R
     for rows in _in_reference(frame, x.shape[1]):
-        own = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
-        x[:, rows] = (R @ own[..., None])[..., 0]
+        in_base_axes = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
+        x[:, rows] = (R @ in_base_axes[..., None])[..., 0]
     return x
 
 
@@ -404,7 +416,9 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     g = state.groups
     e = np.empty(state.nx)
     turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])
-    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
+    if turned[3] < 0.0:
+        turned = -turned
+    e[g.q_b] = turned[:3]
     e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
     e[g.q_m] = state.joints_apart(q_star, q)
     e[-6 - state.robot.n :] = state.velocities(v - v_star)

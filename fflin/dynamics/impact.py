@@ -173,9 +173,14 @@ def struck(
         M[at : at + robot.nv, at : at + robot.nv] = inertia_at(robot, own_q)
         for name in list(robot.model.names)[ROOT + 1 :]:
             if whole.model.existJointName(start + name):
-                here, there = joint_called(robot, name), joint_called(whole, start + name)
-                q[there.idx_q : there.idx_q + there.nq] = own_q[here.idx_q :][: here.nq]
-                rows[here.idx_v, there.idx_v] = 1.0
+                part_joint, whole_joint = (
+                    joint_called(robot, name),
+                    joint_called(whole, start + name),
+                )
+                q[whole_joint.idx_q : whole_joint.idx_q + whole_joint.nq] = own_q[
+                    part_joint.idx_q :
+                ][: part_joint.nq]
+                rows[part_joint.idx_v, whole_joint.idx_v] = 1.0
         rows[:6, :6] = np.eye(6)
         if at:
             frame = whole.model.getFrameId(prefix, pin.FrameType.BODY)
@@ -254,7 +259,7 @@ class Capture(Impact):
     @property
     def told(self) -> str:
         """One-line summary of the event, its impulse and the lost energy."""
-        force, torque = (np.linalg.norm(each) for each in np.split(self.impulse, 2))
+        force, torque = (np.linalg.norm(half) for half in np.split(self.impulse, 2))
         return (
             f"{self.event}: impulse at the grasp {force:.4g} N s and {torque:.4g} N m s, "
             f"{self.energy_lost:.4g} J lost"
@@ -350,13 +355,7 @@ def capture(
     else:
         instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
         other = replace(payload)  # a copy, since the payload may be the same object as the robot
-    for name in ("gravity", "orbit") if isinstance(payload, Robot) else ():
-        own, theirs = (getattr(each, name) for each in (robot, other))
-        if own != theirs:
-            raise InputError(
-                f"the robot's {name} is {own}, but the payload's is {theirs}; give both the same "
-                f"{name}"
-            )
+        _require_same_environment(robot, other)
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload has a momentum but no inertia, so its momentum would be "
@@ -376,6 +375,17 @@ def capture(
     return Capture(**of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix)
 
 
+def _require_same_environment(robot: Robot, payload: Robot) -> None:
+    """Raise `InputError` if two robots differ in gravity or orbit."""
+    for name in ("gravity", "orbit"):
+        robot_value, payload_value = getattr(robot, name), getattr(payload, name)
+        if robot_value != payload_value:
+            raise InputError(
+                f"the robot's {name} is {robot_value}, but the payload's is {payload_value}; give "
+                f"both the same {name}"
+            )
+
+
 def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
     """Return the checked configuration and velocity of a payload, with its base placed at `at`.
 
@@ -389,6 +399,8 @@ def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tupl
         return configuration, np.zeros(other.nv)
     if other.n and dimension("payload_v", v) == 1 and len(v) == 6:
         v = np.concatenate((vector("payload_v", v, 6, "a twist"), np.zeros(other.nv - 6)))
-    expected = "the twist (linear, angular) of the payload" + ", and its joints" * bool(other.n)
+    expected = "the twist (linear, angular) of the payload"
+    if other.n:
+        expected += ", and its joints"
     v = vector("payload_v", v, other.nv, expected)
     return configuration, other.checked_velocity(v)

@@ -197,8 +197,8 @@ def _sums(robot: Robot, bodies: list[_Body], q: Array, v: Array) -> Integrals:
         polar += 0.5 * float(np.trace(body.inertia.inertia))
         total += mass
     center = _times(first, 1.0 / total)
-    for body, each, momentum in zip(bodies, centers, momenta, strict=True):
-        apart = _plus(each, _times(center, -1.0))
+    for body, body_center, momentum in zip(bodies, centers, momenta, strict=True):
+        apart = _plus(body_center, _times(center, -1.0))
         spin = _plus(spin, _cross(apart, momentum))
         polar += body.inertia.mass * _dot(apart, apart)
     axes: Axes = tuple(zip(*rotation_rows(*q[3:7]), strict=True))
@@ -270,7 +270,8 @@ def _turned(axes: Axes, vector: Vector) -> Vector:
     for axis, entry in zip(axes, vector, strict=True):
         # Most frames are parallel to the frame of their parent, so most entries are zero.
         if isinstance(entry, np.ndarray) or entry:
-            total = _times(axis, entry) if total is _ZERO else _plus(total, _times(axis, entry))
+            part = _times(axis, entry)
+            total = part if total is _ZERO else _plus(total, part)
     return total
 
 

@@ -51,8 +51,11 @@ class Integrator(ABC):
         self.model, self.dt = model, dt
         self._displacement, self._speed = self.step_weights(dt)
         self._integrate = _integrate if rows is None else integrate_rows
+        shape: tuple[int, ...] = (1 + len(self.nodes), model.nv)
+        if rows is not None:
+            shape = (rows, *shape)
         # The rows v, l1, l2, ... of a step.
-        self._stages = np.zeros((*(() if rows is None else (rows,)), 1 + len(self.nodes), model.nv))
+        self._stages = np.zeros(shape)
 
     @classmethod
     def step_weights(cls, dt: float) -> tuple[Array, Array]:
@@ -234,7 +237,9 @@ def held_cost(F: Array, W: Array, h: float | Array) -> Array:
     rate, weight = (float(np.abs(X).sum(axis=-2).max()) or 1.0 for X in (F, W))
     # The logarithms are added, because the product of the two numbers may overflow.
     longest = float(h.max())
-    halvings = 1.0 + math.log2(rate) + math.log2(longest) if longest else 0.0
+    halvings = 0.0
+    if longest:
+        halvings = 1.0 + math.log2(rate) + math.log2(longest)
     doublings = max(math.ceil(halvings), 0)
     block = np.zeros((*F.shape[:-2], 2 * n, 2 * n))
     size = weight / rate

@@ -77,7 +77,10 @@ class OrbitField:
         exceed `_USELESS`.
         """
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
-        error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
+        radius = math.inf
+        if self.robot.orbit:
+            radius = self.robot.orbit.radius
+        error = 1.5 * distance / radius
         message = (
             f"'{self.robot.name}' extends to {distance / 1e3:.4g} km from the origin of its orbit "
             f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"
@@ -93,10 +96,10 @@ class OrbitField:
         v and the result are in Pinocchio's order.
         """
         R, position = self.base(q)
-        found = v.copy()
-        found[PIN_LINEAR] += R.T @ (self._turning @ position)
-        found[PIN_ANGULAR] += R.T @ self.rate
-        return found
+        inertial = v.copy()
+        inertial[PIN_LINEAR] += R.T @ (self._turning @ position)
+        inertial[PIN_ANGULAR] += R.T @ self.rate
+        return inertial
 
     def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
         """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2).
@@ -104,11 +107,13 @@ class OrbitField:
         `absolute` (nv,) is the inertial velocity, and `rate` (nv,) is its time derivative.
         """
         frame = absolute - v
-        own = skew(v[PIN_ANGULAR])
-        found = rate.copy()
-        found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
-        found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
-        return found
+        omega_cross = skew(v[PIN_ANGULAR])
+        relative_rate = rate.copy()
+        relative_rate[PIN_LINEAR] += (
+            omega_cross @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
+        )
+        relative_rate[PIN_ANGULAR] += omega_cross @ frame[PIN_ANGULAR]
+        return relative_rate
 
     def wrenches(self, data: pin.Data) -> list[pin.Force]:
         """Return the gravity-gradient wrench on each body, in the frame of the body's joint.

@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
 
     def part(self, rows: slice) -> Sensed:
         """Return views of some rows, such as the rows of one output."""
-        views = [each[rows] for each in self]
+        views = [array[rows] for array in self]
         return Sensed(*views)
 
 
@@ -118,7 +118,9 @@ def _momentum(world: Measuring, _: object) -> Array:
 def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) -> None:
     # The output is the pose of `frame` relative to the frame `other`, or relative to the reference
     # if there is no other frame.
-    origin = at.placement(*other).inverse() if other else pin.SE3(at.R, at.r_b)
+    origin = pin.SE3(at.R, at.r_b)
+    if other:
+        origin = at.placement(*other).inverse()
     relative = origin * at.placement(frame)
     jacobian = at.jacobian(frame)
     R, p = relative.rotation, relative.translation
@@ -133,9 +135,11 @@ def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) ->
 
 
 def _pose(world: Measuring, before: Sequence[Array], frame: Carried, *other: Carried) -> Array:
-    origin = world.placement(*other) if other else world.reference
+    origin, rotation = world.reference, world.reference.rotation
+    if other:
+        origin, rotation = world.placement(*other), before[1]
     relative = origin.actInv(world.placement(frame))
-    attitude = (before[1] if other else origin.rotation).T @ before[0]
+    attitude = rotation.T @ before[0]
     return np.concatenate((relative.translation, pin.log3(attitude.T @ relative.rotation)))
 
 
@@ -286,6 +290,9 @@ class Sensing:
         R, r_b = _STANDING
         if not self._own_reference:
             R, r_b = state.rotation(q), state.positions(q)
+        spin = np.zeros(3)
+        if state.orbit:
+            spin = R.T @ state.orbit[0]
         at = Point(
             model=robot.model,
             data=data,
@@ -296,7 +303,7 @@ class Sensing:
             v_b=v[PIN_LINEAR],
             g=state.gravity(q),
             stored=robot.stored_momentum,
-            spin=R.T @ state.orbit[0] if state.orbit else np.zeros(3),
+            spin=spin,
         )
         point = [at.q, at.v]
         if self.needs_acceleration:
@@ -340,14 +347,14 @@ class Measuring:
         `a` (nv,) is dv/dt as Pinocchio's ABA returns it.
         """
         pin.forwardKinematics(self.model, self.data, q, v, a)
-        return np.concatenate(
-            [
-                KINDS[type(output)][1](self, attitudes, *frames)
-                if type(output) in KINDS
-                else x[states]
-                for output, frames, attitudes, states in self._outputs
-            ]
-        )
+        values = list[Array]()
+        for output, frames, attitudes, states in self._outputs:
+            if type(output) in KINDS:
+                measure = KINDS[type(output)][1]
+                values.append(measure(self, attitudes, *frames))
+            else:
+                values.append(x[states])
+        return np.concatenate(values)
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame in the world."""

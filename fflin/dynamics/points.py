@@ -121,7 +121,10 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
     start = combined(robot.point, robot.start)
     q = configuration(robot, start.get("joints"), base_of(start))
     rates = start.get("velocity")
-    return q, velocity(robot, rates) if rates else np.zeros(robot.nv)
+    v: Array = np.zeros(robot.nv)
+    if rates:
+        v = velocity(robot, rates)
+    return q, v
 
 
 def point_of(
@@ -143,7 +146,8 @@ def point_of(
     if q0 is None and v0 is None:
         return default()
     q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
-    return q, np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
+    v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
+    return q, v
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -215,5 +219,5 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     """
     checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))
-    found = by_name("input", checked, keys)
-    return np.array([found.get(index, 0.0) for index in range(len(keys))])
+    value_at = by_name("input", checked, keys)
+    return np.array([value_at.get(index, 0.0) for index in range(len(keys))])

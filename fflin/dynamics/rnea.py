@@ -164,7 +164,8 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     for index, item in enumerate(model.inertias.tolist()):
         if index > ROOT:
             step = float(np.linalg.norm(model.jointPlacements[index].translation))
-            step += STROKE if kinds[index] == "JointModelP" else 0.0
+            if kinds[index] == "JointModelP":
+                step += STROKE
             distances[index] = distances[parents[index]] + step
         masses[index] = item.mass
         # The largest principal moment is at most the largest row sum of the absolute values of the
@@ -275,7 +276,10 @@ class Accelerations:
             bias = bias - turning
         if tide:
             bias = bias - pull
-        force = (u if actuation.default else columns.dot(u)) - state.forces(bias)
+        force = u
+        if not actuation.default:
+            force = columns.dot(u)
+        force = force - state.forces(bias)
         if self._resists:
             force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
@@ -303,7 +307,8 @@ class Accelerations:
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
-        return AccelerationDerivatives(c, slopes, by_u, tide.fall if tide else state.gravity(q))
+        gravity = tide.fall if tide else state.gravity(q)
+        return AccelerationDerivatives(c, slopes, by_u, gravity)
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

@@ -133,7 +133,8 @@ class StateMap:
         # Whether gravity or the motion in orbit accelerates the base's origin relative to the
         # reference.
         self.falls = self._pulled or robot.orbit is not None
-        self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
+        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
+        self._refer(oMref)
 
     def about(self, reference: pin.SE3) -> StateMap:
         """Return a copy of the map with another reference placement and the same `frame`."""
@@ -150,7 +151,9 @@ class StateMap:
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
         field, R = self.field, oMref.rotation
-        self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
+        self.orbit: tuple[Array, Array] | None = None
+        if field:
+            self.orbit = (R.T @ field.rate, R.T @ field.pull @ R)
 
     @property
     def reference(self) -> pin.SE3:
@@ -198,7 +201,10 @@ class StateMap:
         Unlike the chart, the rotation matrix is regular at an attitude 180 deg from the reference.
         """
         turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
-        return turned if self._aligned else self._rotation.dot(turned)
+        if self._aligned:
+            return turned
+        rotation: Array = self._rotation.dot(turned)
+        return rotation
 
     def gravity(self, q: Array) -> Array:
         """Return gravity (.., 3) [m/s^2] in base axes at valid configurations q (.., nq)."""
@@ -256,7 +262,9 @@ class StateMap:
         """
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.unchecked_chart(q), self.positions(q), q_m, nu)
-        return x if near is None else names.unwound(self, x, near)
+        if near is None:
+            return x
+        return names.unwound(self, x, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""
@@ -307,19 +315,24 @@ class StateMap:
         q[:, self._idx_q] = angles * self._scale[6:]
         q[:, self._cos] = np.cos(angles[:, self.unbounded])
         q[:, self._sin] = np.sin(angles[:, self.unbounded])
-        for row in q if self.robot.followers else ():
-            self.robot.follow(row)
+        if self.robot.followers:
+            for row in q:
+                self.robot.follow(row)
         nu = chart.to_base(self.in_reference, x[:, 6 + self.robot.n :, None])[..., 0]
         return chart, q, self.spread(nu)
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes from Pinocchio's v (.., nv)."""
         nu = v.take(self._order, axis=-1)
-        return nu / self._scale if self._scaled else nu
+        if self._scaled:
+            nu = nu / self._scale
+        return nu
 
     def spread(self, nu: Array) -> Array:
         """Return Pinocchio's v = S nu (.., nv) from nu = (omega_b, v_b, qdot_m) in base axes."""
-        v = (nu * self._scale if self._scaled else nu).take(self._place, axis=-1)
+        if self._scaled:
+            nu = nu * self._scale
+        v = nu.take(self._place, axis=-1)
         for joint, leader, multiplier, _ in self.robot.followers:
             v[..., joint.idx_v] = multiplier * v[..., leader.idx_v]
         return v
@@ -332,11 +345,15 @@ class StateMap:
 
     def forces(self, tau: Array) -> Array:
         """Return generalised forces S^T tau (6 + n, ...) in base axes from tau (nv, ...)."""
-        return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
+        if self.S is None:
+            return tau.take(self._order, axis=0)
+        return self.S.T @ tau
 
     def columns(self, matrix: Array) -> Array:
         """Return ``matrix @ S``: convert columns (..., nv) from Pinocchio's v to state order."""
-        return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
+        if self.S is None:
+            return matrix.take(self._order, axis=1)
+        return matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
         """Return ``S.T @ matrix @ S``: convert a matrix (nv, nv) from Pinocchio's v to state order.
@@ -414,7 +431,7 @@ class Actuation:
         # frame of the joint).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item, own in robot.named_inputs:
+        for item, input_names in robot.named_inputs:
             at = len(columns)
             unit = item.UNIT
             if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
@@ -427,15 +444,15 @@ class Actuation:
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:
-                columns.append(identity[6 + robot.joint_names.index(own[0])])
+                columns.append(identity[6 + robot.joint_names.index(input_names[0])])
             else:
                 assert isinstance(item, kinds.Thruster | kinds.ReactionWheel)
                 joint, placement = find_frame(robot.model, item.frame)
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            names += own
-            units += [unit] * len(own)
+            names += input_names
+            units += [unit] * len(input_names)
             self.groups.setdefault(item.GROUP, []).extend(range(at, len(columns)))
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -496,9 +513,9 @@ class Actuation:
         return external
 
 
-def selection(names: Sequence[str], of: Sequence[str]) -> Array:
+def selection(names: Sequence[str], known: Sequence[str]) -> Array:
     """Return the matrix S (k, n) that selects k of the n entries of a vector by their names.
 
-    `names` lists the names of the selected entries, and `of` lists the names of all entries.
+    `names` lists the names of the selected entries, and `known` lists the names of all entries.
     """
-    return np.eye(len(of))[[*map(of.index, names)]]
+    return np.eye(len(known))[[*map(known.index, names)]]

@@ -104,21 +104,21 @@ def row_products(a: Array, size: int, b: Array, out: Array) -> None:
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
-def _remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
+def _remove_components(Q: Array, size: int, count: int, x: Array, out: Array, first: int) -> None:
     # This is the modified Gram-Schmidt method. The least squares solution is as accurate as with
     # Householder's method, because `_fit` treats the right-hand side as the last column of the
     # matrix.
     for index in range(count):
         share = _row_product(Q, index * size, x, 0, size)
         _add_row(x, 0, -share, Q, index * size, size)
-        found[first + index] = share
+        out[first + index] = share
 
 
 @vec.compiled_as(_remove_components)
-def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, first: int) -> None:
+def remove_components(Q: Array, size: int, count: int, x: Array, out: Array, first: int) -> None:
     """Make x (size,) orthogonal to the first `count` rows of Q.
 
-    These rows must be orthonormal. The components of x along them are written to `found`, from the
+    These rows must be orthonormal. The components of x along them are written to `out`, from the
     index `first` on.
     """
     basis = Q[: count * size].reshape(count, size)
@@ -128,7 +128,7 @@ def remove_components(Q: Array, size: int, count: int, x: Array, found: Array, f
     # pass.
     rest = basis.dot(x)
     x -= rest.dot(basis)
-    np.add(components, rest, found[first : first + count])
+    np.add(components, rest, out[first : first + count])
 
 
 def _write_scaled(source: Array, lane: int, share: float, target: Array) -> None:
@@ -174,22 +174,22 @@ def allocate(allocation, point, commanded):
         vec.copy(commanded, 0, point.u, 0, len(point.u))
         return
     work, asking, giving = allocation.work, allocation.asking, allocation.giving
-    own, tree, problem = allocation.point, asking.tree, allocation.problem
+    work_point, tree, problem = allocation.point, asking.tree, allocation.problem
     size = len(tree.row)
     count = len(problem.least)
     columns = problem.columns
-    vec.copy(point.q, 0, own.q, 0, len(own.q))
-    configure(work, asking, own.q)
+    vec.copy(point.q, 0, work_point.q, 0, len(work_point.q))
+    configure(work, asking, work_point.q)
     factorise(work, tree)
     write_columns(work, tree)
-    vec.copy(commanded, 0, own.pushing, 0, len(commanded))
-    _write_force(work, asking, own, columns, count * size)
+    vec.copy(commanded, 0, work_point.pushing, 0, len(commanded))
+    _write_force(work, asking, work_point, columns, count * size)
     # Write the generalised forces of unit inputs of `giving`, one after the other.
     write_columns(work, giving.tree)
     for unit in range(count):
         for index in range(count):
-            store(own.pushing, index, 1.0 if index == unit else 0.0)
-        _write_force(work, giving, own, columns, unit * size)
+            store(work_point.pushing, index, 1.0 if index == unit else 0.0)
+        _write_force(work, giving, work_point, columns, unit * size)
     # Replace each force f by D^-1/2 L^-T f, whose squared norm is f^T M^-1 f.
     for column in range(count + 1):
         solve_inwards(work, tree, columns, column * size)
@@ -358,7 +358,7 @@ def _steepest(problem, size):
     cost, return -1.
     """
     best = 0.0
-    found = -1
+    best_input = -1
     b = problem.b
     state = problem.state
     slopes = problem.y
@@ -369,8 +369,8 @@ def _steepest(problem, size):
             if state[j] == _HIGH:
                 slope = -slope
             if slope > best:
-                best, found = slope, j
-    return found
+                best, best_input = slope, j
+    return best_input
 
 
 def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:

@@ -57,10 +57,10 @@ def spatial_inertia_times(work, at, motion):
 
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies at q, from the base to the tips."""
-    places, own = tree.places, tree.own
+    places, body_inertias = tree.places, tree.own
     vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
-    _inertia(work, own, places, tree.bodies, 0)
+    _inertia(work, body_inertias, places, tree.bodies, 0)
     for body in range(1, len(tree.parent)):
         at = places + body * PLACE
         value = load(q, tree.index[body])
@@ -81,7 +81,7 @@ def outwards(work, tree, q):
         vec.put3(work, at + 3, vec.minus(vec.times(y, cosine), vec.times(x, sine)))
         vec.put3(work, at + 6, z)
         vec.put3(work, at + 9, vec.plus(origin, vec.times(z, tree.slides[body] * value)))
-        _inertia(work, own + body * INERTIA, at, tree.bodies, body * INERTIA)
+        _inertia(work, body_inertias + body * INERTIA, at, tree.bodies, body * INERTIA)
 
 
 def inwards(work, tree):
@@ -284,10 +284,10 @@ def load_bodies(work, tree):
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD + FORCE
         moving = tree.motion + body * MOTION
-        own = tree.own + body * INERTIA
+        inertia = tree.own + body * INERTIA
         w, v = vec.get6(work, moving + VELOCITY)
-        turning, p = spatial_inertia_times(work, own, (w, v))
-        moment, force = spatial_inertia_times(work, own, vec.get6(work, moving + BIAS))
+        turning, p = spatial_inertia_times(work, inertia, (w, v))
+        moment, force = spatial_inertia_times(work, inertia, vec.get6(work, moving + BIAS))
         moment = vec.plus(moment, vec.plus(vec.cross(w, turning), vec.cross(v, p)))
         vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(tree.stored_body)):
@@ -310,12 +310,12 @@ def collect_momenta(work, tree):
     """
     for body in range(len(tree.parent)):
         at = tree.load + body * LOAD
-        own = tree.own + body * INERTIA
+        inertia = tree.own + body * INERTIA
         w, v = vec.get6(work, tree.motion + body * MOTION + VELOCITY)
-        h = vec.get3(work, own + 1)
-        vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
+        h = vec.get3(work, inertia + 1)
+        vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, inertia, (w, v))[1])
         # The second moments of mass, the sum of m r r^T, are tr(I) / 2 times the identity, minus I.
-        (xx, xy, xz), (yy, yz, zz) = vec.get6(work, own + 4)
+        (xx, xy, xz), (yy, yz, zz) = vec.get6(work, inertia + 4)
         trace = 0.5 * (xx + yy + zz)
         second = (trace - xx, -xy, -xz), (-xy, trace - yy, -yz), (-xz, -yz, trace - zz)
         for axis in range(3):
@@ -411,8 +411,8 @@ def accelerate_bodies(work, tree):
     for body in range(len(tree.parent) - 1, 0, -1):
         at = tree.load + body * LOAD
         added = vec.get6(work, tree.motion + body * MOTION + ADDED)
-        own = spatial_inertia_times(work, tree.own + body * INERTIA, added)
-        carried = vec.plus6(vec.get6(work, at + CARRIED), own)
+        inertial_force = spatial_inertia_times(work, tree.own + body * INERTIA, added)
+        carried = vec.plus6(vec.get6(work, at + CARRIED), inertial_force)
         vec.add6(work, at + FORCE, carried)
         to = tree.load + tree.parent[body] * LOAD + CARRIED
         vec.add6(work, to, at_parent(work, tree.places + body * PLACE, carried))

@@ -162,13 +162,13 @@ def _compile_unstored(compile: Callable[[object], object], name: str, signature:
 
 
 @contextmanager
-def _seconds_shown(what: str) -> Iterator[None]:
+def _seconds_shown(subject: str) -> Iterator[None]:
     """Show the elapsed time [s] of a compilation on a terminal, until the context ends."""
     done, begun, bar = Event(), time.monotonic(), Progress()
 
     def count() -> None:
         while not done.wait(_INTERVAL):
-            bar.say(f"compiling {what}: {time.monotonic() - begun:.0f} s ")
+            bar.say(f"compiling {subject}: {time.monotonic() - begun:.0f} s ")
 
     thread = Thread(target=count, daemon=True)
     thread.start()
@@ -208,8 +208,10 @@ def _between_processes(path: Path) -> ExitStack:
 def is_kept(module: str, name: str) -> bool:
     """Return whether the disk has machine code of a function, compiled from the current sources."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    own = Path(__file__).parent
-    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
+    kernel_folder = Path(__file__).parent
+    folders = (
+        Path(chosen).glob(f"{kernel_folder.name}_*") if chosen else [kernel_folder / "__pycache__"]
+    )
     return any(_stored(folder, module, name)[0] for folder in folders)
 
 

@@ -108,7 +108,7 @@ def differentiate(work, tree):
         by_q = vec.plus6(by_q, (turned, vec.cross(axis[0], force)))
         weight = inertia_times(work, inertia, psi)
         by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
-        own = tree.lower + column * width
+        joint_row = tree.lower + column * width
         above = body
         while above > 0:
             place = tree.places + above * PLACE
@@ -120,14 +120,16 @@ def differentiate(work, tree):
             if above != body:
                 moving = tree.motion + above * MOTION
                 psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
-                vec.add(work, own + other, vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2))
+                vec.add(
+                    work, joint_row + other, vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2)
+                )
                 value = vec.dot6(momentum, psi)
                 value = vec.dot(coriolis, axis[0]) + (value + value)
-                vec.add(work, own + (other + 6 + n), value)
+                vec.add(work, joint_row + (other + 6 + n), value)
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
+        vec.add3(work, joint_row + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         bodies.add_column(work, tree.lower + column, width, by_q)
         bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
     # Write the derivatives of the base's moment and force with respect to omega_b.

@@ -307,6 +307,6 @@ def impose(work, robot, reference, point, t):
     f, g, h = xy + lever[0] * d[1], xz + lever[0] * d[2], yz + lever[1] * d[2]
     x, y, z = b * c - h * h, g * h - f * c, f * h - g * b
     inverse = 1.0 / (a * x + f * y + g * z)
-    by = (x, y, z), (y, a * c - g * g, f * g - a * h), (z, f * g - a * h, a * b - f * f)
-    w = vec.times(vec.product(by, about), inverse)
+    adjugate = (x, y, z), (y, a * c - g * g, f * g - a * h), (z, f * g - a * h, a * b - f * f)
+    w = vec.times(vec.product(adjugate, about), inverse)
     vec.add6(nu, 0, (w, vec.plus(vec.times(linear, per_mass), vec.cross(d, w))))

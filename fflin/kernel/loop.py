@@ -285,10 +285,16 @@ def advance(words, clock, last, every, rows, work):
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
     mass (3,). `work` has `Tree.size` entries.
     """
-    of = ARGUMENTS(words)
-    robot, method, law, channel, kept = of.robot, of.method, of.law, of.channel, of.reference
+    arguments = ARGUMENTS(words)
+    robot, method, law, channel, kept = (
+        arguments.robot,
+        arguments.method,
+        arguments.law,
+        arguments.channel,
+        arguments.reference,
+    )
     # `at` is the index of the next entry in `rows`
-    point = of.point
+    point = arguments.point
     h = method.h
     at = 0
     forward.configure(work, robot, point.q)
@@ -317,7 +323,7 @@ def advance(words, clock, last, every, rows, work):
                     vec.put3(rows, at + 6, center)
                     at += 9
             forward.accelerate(work, robot, point, method.rates, (1 + stage) * len(point.nu))
-            if of.pushed:
+            if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
             _move(robot, method, point, stage)
@@ -325,10 +331,10 @@ def advance(words, clock, last, every, rows, work):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
         forward.end_step(kept, h)
-        if of.project:
+        if arguments.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not goes_on(of.stop, robot.origin, point.q, point.nu):
+        if not goes_on(arguments.stop, robot.origin, point.q, point.nu):
             break
 
 
@@ -382,10 +388,10 @@ def _compare(stats, step):
     The error of a kind is the largest magnitude of the errors of its states. The error of kind 0 is
     the angle [deg] of the attitude error.
     """
-    at, there, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
+    at, followed, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
     if len(stats.q_ref) > 0:
-        vec.copy(stats.q_ref, step * len(there.q), there.q, 0, len(there.q))
-        vec.copy(stats.nu_ref, step * len(there.nu), there.nu, 0, len(there.nu))
+        vec.copy(stats.q_ref, step * len(followed.q), followed.q, 0, len(followed.q))
+        vec.copy(stats.nu_ref, step * len(followed.nu), followed.nu, 0, len(followed.nu))
         error(stats.robot, stats.path, at)
     else:
         read_state(stats.robot, stats.law, at, 0)
@@ -399,7 +405,7 @@ def _compare(stats, step):
             _grow(stats.largest_x, index, value)
         if kind > 0:
             _grow(sizes, kind, value)
-    (x, y, z), w = vec.attitude(there.q)
+    (x, y, z), w = vec.attitude(followed.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(at.q))
     half = angle(root(vec.dot(vector, vector)), _size(scalar))
     store(sizes, 0, half * (360.0 / np.pi))

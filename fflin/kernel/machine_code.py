@@ -132,8 +132,8 @@ def _operation(
                     given[0] = context.make_array(kinds[0])(context, builder, values[0]).data
                     if kinds[0].ndim == 2:
                         given[0] = builder.bitcast(given[0], _VECTOR.as_pointer())
-                found = generate(builder, *given)
-                return context.get_dummy_value() if found is None else found
+                result = generate(builder, *given)
+                return context.get_dummy_value() if result is None else result
 
             return typed(*kinds), generated
 
@@ -162,9 +162,9 @@ def _store(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, value: ir.Va
 
 def _rounding(replaced: Callable[..., object], name: str) -> None:
     def generate(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-        of = f"v{LANES}f64" if value.type == _VECTOR else "f64"
+        type_name = f"v{LANES}f64" if value.type == _VECTOR else "f64"
         function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(value.type, [value.type]), f"llvm.{name}.{of}"
+            builder.module, ir.FunctionType(value.type, [value.type]), f"llvm.{name}.{type_name}"
         )
         return builder.call(function, [value])
 
@@ -248,26 +248,26 @@ class PartLibrary(CPUCodeLibrary):
         self._ensure_finalized()
         return 0
 
-    def _called(self, found: dict[CodeLibrary, ir.Module]) -> None:
-        """Add to the dict `found` the LLVM code of all functions that this part calls.
+    def _called(self, modules: dict[CodeLibrary, ir.Module]) -> None:
+        """Add to the dict `modules` the LLVM code of all functions that this part calls.
 
         Indirectly called functions are included. Each function is added once.
         """
         for library in self._linking_libraries:
-            if library not in found:
+            if library not in modules:
                 part = isinstance(library, PartLibrary)
                 get = CPUCodeLibrary if part else type(library)
-                found[library] = get._get_module_for_linking(library)
+                modules[library] = get._get_module_for_linking(library)
                 if part:
-                    library._called(found)
+                    library._called(modules)
 
     def _get_module_for_linking(self) -> ir.Module:
         """Return the LLVM code of this part together with one copy of each called function."""
         if self._whole is None:
-            found = {self: super()._get_module_for_linking()}
-            self._called(found)
-            own, *called = found.values()
-            self._whole = own.clone()
+            modules = {self: super()._get_module_for_linking()}
+            self._called(modules)
+            part, *called = modules.values()
+            self._whole = part.clone()
             for module in called:
                 self._whole.link_in(module, preserve=True)
         return self._whole
@@ -309,15 +309,15 @@ class _Fields(AttributeTemplate):
     key = _StructType
 
     def generic_resolve(self, kind: _StructType, name: str) -> Type | None:
-        found = kind.struct.kinds.get(name)
-        return None if found is None else _numba_type(found)
+        field_kind = kind.struct.kinds.get(name)
+        return None if field_kind is None else _numba_type(field_kind)
 
 
 @extending.lower_getattr_generic(_StructType)
 def _field(
     context: BaseContext, builder: ir.IRBuilder, kind: _StructType, words: ir.Value, name: str
 ) -> ir.Value:
-    found = _numba_type(kind.struct.kinds[name])
+    field_kind = _numba_type(kind.struct.kinds[name])
     first = kind.struct.places[name]
 
     def at(place: int) -> ir.Value:
@@ -329,17 +329,19 @@ def _field(
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
         return value
 
-    if isinstance(found, _StructType):
+    if isinstance(field_kind, _StructType):
         return at(0)
-    if found == float64:
+    if field_kind == float64:
         return builder.bitcast(word(0), _DOUBLE)
-    if found == boolean:
+    if field_kind == boolean:
         return builder.trunc(word(0), ir.IntType(1))
-    if not isinstance(found, Array):
+    if not isinstance(field_kind, Array):
         return word(0)
-    array = context.make_array(found)(context, builder)
-    shape = [word(1 + axis) for axis in range(found.ndim)]
-    size = context.get_constant(intp, context.get_abi_sizeof(context.get_data_type(found.dtype)))
+    array = context.make_array(field_kind)(context, builder)
+    shape = [word(1 + axis) for axis in range(field_kind.ndim)]
+    size = context.get_constant(
+        intp, context.get_abi_sizeof(context.get_data_type(field_kind.dtype))
+    )
     strides = [size]
     for length in shape[:0:-1]:
         strides.insert(0, builder.mul(strides[0], length))

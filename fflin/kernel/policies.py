@@ -82,24 +82,24 @@ def error(robot, path, point):
     """
     e = path.e
     q = point.q
-    there = path.point
+    followed = path.point
     n = len(robot.index)
-    (x, y, z), w = vec.attitude(there.q)
+    (x, y, z), w = vec.attitude(followed.q)
     vector, scalar = vec.quaternion_times(((-x, -y, -z), w), vec.attitude(q))
     vec.put3(e, 0, vec.times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
-    apart = vec.minus(vec.get3(q, 0), vec.get3(there.q, 0))
-    vec.put3(e, 3, vec.across(vec.axes_of(there.q), apart))
+    apart = vec.minus(vec.get3(q, 0), vec.get3(followed.q, 0))
+    vec.put3(e, 3, vec.across(vec.axes_of(followed.q), apart))
     for joint in range(n):
         at = robot.index[joint]
         if robot.circling[joint]:
             c, s = load(q, at), load(q, at + 1)
-            c_0, s_0 = load(there.q, at), load(there.q, at + 1)
+            c_0, s_0 = load(followed.q, at), load(followed.q, at + 1)
             store(e, 6 + joint, angle(s * c_0 - c * s_0, c * c_0 + s * s_0))
         else:
-            apart_by = load(q, at) - load(there.q, at)
+            apart_by = load(q, at) - load(followed.q, at)
             store(e, 6 + joint, apart_by / load(robot.scale, joint))
     for index in range(6 + n):
-        store(e, 6 + n + index, load(point.nu, index) - load(there.nu, index))
+        store(e, 6 + n + index, load(point.nu, index) - load(followed.nu, index))
 
 
 def track(robot, path, point, u, t):
@@ -109,7 +109,7 @@ def track(robot, path, point, u, t):
     followed point.
     """
     # Evaluate the trajectory at the time t.
-    there = path.point
+    followed = path.point
     last = len(path.t) - 2
     knots = path.t
     count = len(path.point.u)
@@ -121,21 +121,21 @@ def track(robot, path, point, u, t):
         k = last + 2
         at = last + 2
         share = 0.0
-    vec.copy(path.q, k * len(there.q), there.q, 0, len(there.q))
+    vec.copy(path.q, k * len(followed.q), followed.q, 0, len(followed.q))
     for index in range(count):
         value = path.u[at * count + index]
         if share > 0.0 and not path.hold:
             value += share * (path.u[(at + 1) * count + index] - value)
-        there.u[index] = value
+        followed.u[index] = value
     if after:
-        vec.copy(path.speed, 4 * (last + 1) * len(there.nu), there.nu, 0, len(there.nu))
+        vec.copy(path.speed, 4 * (last + 1) * len(followed.nu), followed.nu, 0, len(followed.nu))
     else:
         _cubic(path.shift, k, s, path.along)
-        _cubic(path.speed, k, s, there.nu)
-        vec.displace(robot.tree, there.q, path.along, there.q)
+        _cubic(path.speed, k, s, followed.nu)
+        vec.displace(robot.tree, followed.q, path.along, followed.q)
     for index in range(len(path.held)):
         at = path.held[index]
-        vec.put3(there.u, at, vec.across(vec.axes_of(there.q), vec.get3(there.u, at)))
+        vec.put3(followed.u, at, vec.across(vec.axes_of(followed.q), vec.get3(followed.u, at)))
     # Compute the error of the robot and evaluate the gain.
     error(robot, path, point)
     starts = path.starts
@@ -146,7 +146,7 @@ def track(robot, path, point, u, t):
     k = len(starts) if after else k
     first, size = k * path.order * count * width, count * width
     for row in range(count):
-        total = there.u[row]
+        total = followed.u[row]
         for column in range(width):
             at = first + row * width + column
             gain = 0.0
@@ -324,25 +324,39 @@ def _corner(grid, corner, lane):
 
 
 @called
-def _filter(by, y, u, row, stage):
+def _filter(controller, y, u, row, stage):
     """Write the command u of a linear controller, and the controller's next z or dz/dt.
 
-    `by` is the linear controller, a `Filter`. The outputs y are replaced by dy = y - y0.
+    `controller` is a `Filter`. The outputs y are replaced by dy = y - y0.
     """
-    size, outputs, inputs = len(by.z), len(y), len(u)
-    along = len(by.rates) > size
+    size, outputs, inputs = len(controller.z), len(y), len(u)
+    along = len(controller.rates) > size
     first = (1 + stage) * size if along else 0
     for index in range(size):
-        store(by.z, index, load(by.z, index) + load(by.jump, row * size + index))
+        store(
+            controller.z,
+            index,
+            load(controller.z, index) + load(controller.jump, row * size + index),
+        )
     for index in range(outputs):
-        store(y, index, load(y, index) - load(by.y0, row * outputs + index))
+        store(y, index, load(y, index) - load(controller.y0, row * outputs + index))
     for index in range(inputs):
         at = row * inputs + index
-        store(u, index, load(by.u0, at) + _times(by.C, at, by.z) + _times(by.D, at, y))
+        store(
+            u,
+            index,
+            load(controller.u0, at)
+            + _times(controller.C, at, controller.z)
+            + _times(controller.D, at, y),
+        )
     if first == size:
-        vec.copy(by.z, 0, by.rates, 0, size)
+        vec.copy(controller.z, 0, controller.rates, 0, size)
     for index in range(size):
         at = row * size + index
-        store(by.rates, first + index, _times(by.A, at, by.z) + _times(by.B, at, y))
+        store(
+            controller.rates,
+            first + index,
+            _times(controller.A, at, controller.z) + _times(controller.B, at, y),
+        )
     if not along:
-        vec.copy(by.rates, 0, by.z, 0, size)
+        vec.copy(controller.rates, 0, controller.z, 0, size)

@@ -95,11 +95,13 @@ class Struct(Generic[T_co]):
 def empty(kind: Struct[T]) -> T:
     """Return a named tuple with the fields of a struct: empty arrays, and 0 for each number."""
     parts: list[object] = []
-    for of in kind.kinds.values():
-        if isinstance(of, Struct):
-            parts.append(empty(of))
+    for field_kind in kind.kinds.values():
+        if isinstance(field_kind, Struct):
+            parts.append(empty(field_kind))
         else:
-            parts.append(np.zeros((0,) * of.axes, of.dtype) if of.axes else 0)
+            parts.append(
+                np.zeros((0,) * field_kind.axes, field_kind.dtype) if field_kind.axes else 0
+            )
     return kind.made._make(parts)
 
 
@@ -122,22 +124,24 @@ def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Arra
     to `fresh`.
     """
     parts: list[object] = []
-    for part, of in zip(value, kind.kinds.values(), strict=True):
-        if isinstance(of, Struct):
-            parts.append(_lay_out(part, of, words, fresh))
-        elif of.axes:
-            array = np.ascontiguousarray(part, of.dtype)
-            if of == LANED:
+    for part, field_kind in zip(value, kind.kinds.values(), strict=True):
+        if isinstance(field_kind, Struct):
+            parts.append(_lay_out(part, field_kind, words, fresh))
+        elif field_kind.axes:
+            array = np.ascontiguousarray(part, field_kind.dtype)
+            if field_kind == LANED:
                 column, array = array.reshape(-1, 1).copy(), work_space(len(array))
                 array[:] = column
                 fresh.append((array, column))
-            assert array.ndim == of.axes
+            assert array.ndim == field_kind.axes
             parts.append(array)
             words += (address_of(array), *array.shape)
         else:
-            number = of.dtype(part).item()
+            number = field_kind.dtype(part).item()
             parts.append(number)
-            words.append(int(np.float64(number).view(np.int64)) if of == REAL else int(number))
+            words.append(
+                int(np.float64(number).view(np.int64)) if field_kind == REAL else int(number)
+            )
     return value._make(parts)
 
 

@@ -118,38 +118,38 @@ class Route:
 
         # To sample the rounding errors, the derivatives are computed again at points that differ by
         # _NUDGE, and with M^-1 of CRBA in place of ABA's M^-1.
-        found = _dynamics(self.aba, self.q, self.v, self._u)
+        dynamics = _dynamics(self.aba, self.q, self.v, self._u)
         inertia = _in_base(state, self.q, self.M)
         others = [_dynamics(self.aba, self.q, self.v, self._u, inertia)]
         rng = np.random.default_rng(0)
         others += [_dynamics(self.aba, *self._nudged(rng)) for _ in range(_SAMPLES)]
-        self.at = self._own.jacobians(self.q, self.nu, self._u, found.rates)
+        self.at = self._own.jacobians(self.q, self.nu, self._u, dynamics.rates)
         self.frame_size = _whole(self.at.P, len(self.M))
-        self._accelerations(found, others)
-        self._matrices(found, others, inverse)
+        self._accelerations(dynamics, others)
+        self._matrices(dynamics, others, inverse)
 
-    def _accelerations(self, found: Dynamics, others: list[Dynamics]) -> None:
-        self.accelerations = self._by_state(found)
+    def _accelerations(self, dynamics: Dynamics, others: list[Dynamics]) -> None:
+        self.accelerations = self._by_state(dynamics)
         self.samples = [self._by_state(other) for other in others]
         parts = {"omega_b": ANGULAR, "v_b": LINEAR, "qdot_m": slice(6, None)}
         rates = [other.rates[:, None] for other in self.samples]
-        self.rates_error = sampled(parts, found.rates[:, None], rates, self.base_mobility)[:, 0]
+        self.rates_error = sampled(parts, dynamics.rates[:, None], rates, self.base_mobility)[:, 0]
 
-    def _by_state(self, found: Dynamics) -> Accelerations:
-        by_y = np.hstack((found.by_q, found.by_v)) + found.by_u @ self.at.H
-        return Accelerations(found.rates, by_y @ self.at.left, found.by_u @ self.at.V)
+    def _by_state(self, dynamics: Dynamics) -> Accelerations:
+        by_y = np.hstack((dynamics.by_q, dynamics.by_v)) + dynamics.by_u @ self.at.H
+        return Accelerations(dynamics.rates, by_y @ self.at.left, dynamics.by_u @ self.at.V)
 
-    def _matrices(self, found: Dynamics, others: list[Dynamics], inverse: Array) -> None:
+    def _matrices(self, dynamics: Dynamics, others: list[Dynamics], inverse: Array) -> None:
         groups = self.state.groups._asdict()
         inputs = self.aba.actuation.groups
         nv = len(self.M)
-        A, B = self._assembled(found)
+        A, B = self._assembled(dynamics)
         more = [self._assembled(other) for other in others]
         lower = B[nv:]
         mobility = np.sqrt(np.einsum("ik,ij,jk->k", lower, self.M, lower))
         self.input_mobility = np.where(mobility > 0.0, mobility, 1.0)
 
-        sums_A, sums_B = self._sums(found)
+        sums_A, sums_B = self._sums(dynamics)
         # The derivatives of the accelerations are sums of entries of M^-1 times derivatives of
         # generalised forces.
         weights = np.abs(inverse)
@@ -173,8 +173,8 @@ class Route:
         rounding += sampled(groups, B, [x for _, x in more], units)
         self.B = Reference(B, scale, rounding)
 
-    def _assembled(self, found: Dynamics) -> tuple[Array, Array]:
-        return _assembled(self._own, self.q, self.nu, self._u, found)
+    def _assembled(self, dynamics: Dynamics) -> tuple[Array, Array]:
+        return _assembled(self._own, self.q, self.nu, self._u, dynamics)
 
     def _nudged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return q, v and the inputs in base axes, changed by _NUDGE."""
@@ -190,7 +190,7 @@ class Route:
         q = pin.integrate(state.robot.model, self.q, step)
         return q, state.spread(self.nu * faster), self._u * stronger
 
-    def _sums(self, found: Dynamics) -> tuple[Array, Array]:
+    def _sums(self, dynamics: Dynamics) -> tuple[Array, Array]:
         """Sum the magnitudes of the terms of A and B when they are transformed to the frame."""
         nv = len(self.M)
         at = self.at
@@ -198,7 +198,10 @@ class Route:
         A[:nv, nv:] = np.eye(nv)
         A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = _norm(self.nu[ANGULAR])
         A[LINEAR, ANGULAR] = _norm(self.nu[LINEAR])
-        A[nv:], B[nv:] = np.hstack((np.abs(found.by_q), np.abs(found.by_v))), np.abs(found.by_u)
+        A[nv:], B[nv:] = (
+            np.hstack((np.abs(dynamics.by_q), np.abs(dynamics.by_v))),
+            np.abs(dynamics.by_u),
+        )
         P = self.frame_size
         left = _whole(at.left, nv)
         A = (P @ (A + B @ np.abs(at.H)) + _whole(at.rate, nv)) @ left
@@ -228,12 +231,12 @@ def _whole(x: Array, nv: int) -> Array:
 
     The rounding error of an entry of a rotation matrix is relative to 1, not to the entry.
     """
-    found = np.abs(x)
+    sizes = np.abs(x)
     starts = (0, 3, nv, nv + 3)
     for i in starts:
         for j in starts:
-            found[i : i + 3, j : j + 3] = found[i : i + 3, j : j + 3].max()
-    return found
+            sizes[i : i + 3, j : j + 3] = sizes[i : i + 3, j : j + 3].max()
+    return sizes
 
 
 def scaled_condition(M: Array) -> float:
@@ -286,25 +289,25 @@ def aba_route(
     state = aba.state
     nu = state.velocities(v)
     u = aba.actuation.in_base_axes(state.chart(q), u)
-    found = _dynamics(aba, q, v, u)
-    A, B = _assembled(ToolCoordinates(state, moving=moving), q, nu, u, found)
+    dynamics = _dynamics(aba, q, v, u)
+    A, B = _assembled(ToolCoordinates(state, moving=moving), q, nu, u, dynamics)
     return A, B, aba.inverse
 
 
 def _assembled(
-    own: ToolCoordinates, q: Array, nu: Array, u: Array, found: Dynamics
+    coordinates: ToolCoordinates, q: Array, nu: Array, u: Array, dynamics: Dynamics
 ) -> tuple[Array, Array]:
     """Assemble A and B from the derivatives of the accelerations; `nu` and `u` are in base axes."""
-    state = own.state
+    state = coordinates.state
     nv = len(nu)
-    there = own.jacobians(q, nu, u, found.rates)
+    jacobians = coordinates.jacobians(q, nu, u, dynamics.rates)
     # Assemble A_y and B_y of (4.9). The upper half of A_y is the kinematics of a small displacement
     # in axes that rotate with the base.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
     A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
     A[:nv, nv:] = np.eye(nv)
-    A[nv:] = np.hstack((found.by_q, found.by_v))
-    B[nv:] = found.by_u
-    A = (there.P @ (A + B @ there.H) + there.rate) @ there.left
-    return A, there.P @ B @ there.V
+    A[nv:] = np.hstack((dynamics.by_q, dynamics.by_v))
+    B[nv:] = dynamics.by_u
+    A = (jacobians.P @ (A + B @ jacobians.H) + jacobians.rate) @ jacobians.left
+    return A, jacobians.P @ B @ jacobians.V

@@ -101,14 +101,15 @@ class Check:
         if failures := self.failures:
             blocks = list(dict.fromkeys(row.block for row in failures))
             names = [self._failed(block) for block in blocks[:6]]
-            names += ["..."] * (len(blocks) > 6)
+            if len(blocks) > 6:
+                names.append("...")
             verb = "is" if len(blocks) == 1 else "are"
             count = f"{len(failures)} of {len(self.rows)} comparisons FAILED"
             verdict = f"{', '.join(names)} {verb} not verified: {count}"
         else:
             largest = max(self.rows, key=lambda row: row.error)
-            said = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"{self._verified} are verified: largest error {said}"
+            error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
+            verdict = f"{self._verified} are verified: largest error {error_text}"
         table = [["compared with", "comparisons", "largest error", "of", "allowed"]]
         for test in dict.fromkeys(row.test for row in self.rows):
             rows = [row for row in self.rows if row.test == test]
@@ -179,15 +180,18 @@ def check_all(
         tolerance = share("tolerance", tolerance)
     largest: dict[tuple[str, str], Row] = {}
     for lin in models:
-        for found in _comparisons(robot, lin):
-            row = found if tolerance is None else found._replace(tolerance=tolerance)
+        for comparison in _comparisons(robot, lin):
+            row = comparison
+            if tolerance is not None:
+                row = comparison._replace(tolerance=tolerance)
             before = largest.setdefault((row.test, row.block), row)
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 largest[row.test, row.block] = row
         if not title:
             condition = scaled_condition(inertia_matrix(robot, lin))
             title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
-    title += "" if tolerance is None else f", each error at most {tolerance:.1e}"
+    if tolerance is not None:
+        title += f", each error at most {tolerance:.1e}"
     return Check(tuple(largest.values()), title)
 
 
@@ -220,10 +224,10 @@ class References:
 
     def matrices(self) -> dict[str, Reference]:
         """Return A and B by ABA, and C and D if the output is not the state."""
-        found = {"A": self.route.A, "B": self.route.B}
+        references = {"A": self.route.A, "B": self.route.B}
         if self._outputs is not None:
-            found |= {"C": self._outputs.C, "D": self._outputs.D}
-        return found
+            references |= {"C": self._outputs.C, "D": self._outputs.D}
+        return references
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare a model that has this operating point."""
@@ -261,8 +265,9 @@ class References:
     def _inertia(self, lin: LinearModel) -> Iterator[Row]:
         route, M = self.route, self.route.M
         # If the inputs are the default ones, the lower half of B is M^-1.
-        default = route.aba.actuation.default
-        inverse = lin.B[-len(M) :] if default else inverse_inertia(route.state, lin)
+        inverse = lin.B[-len(M) :]
+        if not route.aba.actuation.default:
+            inverse = inverse_inertia(route.state, lin)
         scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
         scaled = scale[:, None] * inverse * scale
         least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])

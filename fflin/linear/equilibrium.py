@@ -78,17 +78,17 @@ class Equilibrium(FrozenArrays):
     force_units: tuple[str, ...]
 
     def __str__(self) -> str:
-        said = "u: all zero"
+        text = "u: all zero"
         if self.u.any():
-            said = signals("u", self.u, self.input_names, self.input_units)
+            text = signals("u", self.u, self.input_names, self.input_units)
         if self.tilt.any():
             angles = np.degrees(self.tilt)
-            said += f"\n{signals('tilt of the base', angles, ('x', 'y', 'z'), ('deg',) * 3)}"
+            text += f"\n{signals('tilt of the base', angles, ('x', 'y', 'z'), ('deg',) * 3)}"
         if not (shown := np.where(np.abs(self.sag) > _ROUNDING, self.sag, 0.0)).any():
-            return said
+            return text
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
-        return f"{said}\n{signals('deflections', shown, names, units)}"
+        return f"{text}\n{signals('deflections', shown, names, units)}"
 
 
 def equilibrium(
@@ -192,37 +192,19 @@ def equilibrium(
     tilt = truth("tilt", tilt)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     if robot.orbit:  # put the reference at the base, so that forces and inputs are in base axes
-        own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
-        linearizer = Linearizer(robot, frame=frame, reference=own)
+        base_pose = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
+        linearizer = Linearizer(robot, frame=frame, reference=base_pose)
     else:
         linearizer = Linearizer(robot, moving=True)
     balance = first = _settled(linearizer, state, given, v, spun=False)
     if tilt and first.asks_tilt:
         balance = _tilted(linearizer, state, first, v)
-    attempts = [(given, True)] * bool(first.lin.wheels)
-    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
-        centered = on_orbit(robot, given, state.frame)
-        attempts += [(centered, False), *[(centered, True)] * bool(first.lin.wheels)]
-    for at, spun in attempts:
-        if balance.holds:
-            break
-        balance = _settled(linearizer, state, at, v, spun=spun)
-    balance = balance if balance.holds else first
-    pushes = forces_of(robot)
+    balance = _with_other_points(linearizer, state, balance, given, v)
     if not balance.holds:
-        sizes, named = np.abs(balance.left), list(pushes.items())
-        forces = [
-            f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
-            for i in np.argsort(-sizes)  # the largest scaled force first
-            if sizes[i] > 1e-6 * sizes.max()
-        ]
-        advice = "add inputs that balance these forces (thrusters cannot pull)"
-        if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
-            advice += ", set gravity to zero if the robot falls freely"
-        raise EquilibriumError(
-            f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
-            f"forces: {listed(forces)}; {advice}, or choose another point"
-        )
+        balance = first
+    if not balance.holds:
+        raise _unbalanced(robot, balance)
+    pushes = forces_of(robot)
     at = balance.lin.q
     u = balance.u
     actuation = Actuation(state)
@@ -231,8 +213,10 @@ def equilibrium(
         R = state.reference.rotation.T @ base.rotation
         for columns in actuation.held:
             u[columns] = R @ u[columns]
-    turned = pin.log3(pin.Quaternion(given[3:7]).matrix().T @ pin.Quaternion(at[3:7]).matrix())
-    rotation = turned if (at[3:7] != given[3:7]).any() else np.zeros(3)
+    rotation = np.zeros(3)
+    if (at[3:7] != given[3:7]).any():
+        before, after = pin.Quaternion(given[3:7]), pin.Quaternion(at[3:7])
+        rotation = pin.log3(before.matrix().T @ after.matrix())
     names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
     sag = state.joints_apart(given, at)
     return Equilibrium(at, u, sag, rotation, balance.residual, *names)
@@ -256,6 +240,44 @@ def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
     return placed
 
 
+def _with_other_points(
+    linearizer: Linearizer, state: StateMap, balance: _Balance, given: Array, v: Array | None
+) -> _Balance:
+    """Return `balance` if it holds, or a balance with accelerating wheels or on the orbit."""
+    robot = linearizer.robot
+    wheels = balance.lin.wheels
+    attempts = list[tuple[Array, bool]]()  # configuration, and whether the wheels may accelerate
+    if wheels:
+        attempts.append((given, True))
+    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
+        centered = on_orbit(robot, given, state.frame)
+        attempts.append((centered, False))
+        if wheels:
+            attempts.append((centered, True))
+    for at, spun in attempts:
+        if balance.holds:
+            break
+        balance = _settled(linearizer, state, at, v, spun=spun)
+    return balance
+
+
+def _unbalanced(robot: Robot, balance: _Balance) -> EquilibriumError:
+    """Return the error that lists the residual forces of a balance, the largest first."""
+    sizes, named = np.abs(balance.left), list(forces_of(robot).items())
+    forces = [
+        f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
+        for i in np.argsort(-sizes)  # the largest scaled force first
+        if sizes[i] > 1e-6 * sizes.max()
+    ]
+    advice = "add inputs that balance these forces (thrusters cannot pull)"
+    if any(robot.gravity) and any(force.startswith("F_b") for force in forces):
+        advice += ", set gravity to zero if the robot falls freely"
+    return EquilibriumError(
+        f"the inputs of '{robot.name}' cannot balance the forces on it at this point; residual "
+        f"forces: {listed(forces)}; {advice}, or choose another point"
+    )
+
+
 def _settled(
     linearizer: Linearizer, state: StateMap, given: Array, v: Array | None, *, spun: bool
 ) -> _Balance:
@@ -275,8 +297,8 @@ def _settled(
             break
         lin, step = linearizer(balance.lin.q, v, balance.u), np.zeros(len(soft))
         hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
-        own = np.sqrt(robot.springs.stiffness[soft[6:]])
-        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
+        scale = np.sqrt(robot.springs.stiffness[soft[6:]])
+        if np.linalg.eigvals(hold / np.outer(scale, scale)).real.min() <= TOLERANCE:
             weak = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
             raise EquilibriumError(
                 f"the springs of {weak} are too weak to hold '{robot.name}' at this "
@@ -337,13 +359,18 @@ class _Balance:
         # Compute bounds (6 + n,) of the rounding errors in the forces, because large terms may
         # cancel in the forces.
         state, springs = linearizer.prepared.map, robot.springs
-        absolute = state.field.absolute(lin.q, lin.v) if state.field else lin.v
+        absolute = lin.v
+        if state.field:
+            absolute = state.field.absolute(lin.q, lin.v)
         speed = np.abs(state.velocities(absolute))
         rounding = max(speed[:3].max(), speed[6:].max(initial=0.0)) * (np.abs(M) @ speed)
         farthest = np.abs(state.joint_positions(lin.q)) + np.abs(springs.rest)
         rounding[6:] += springs.stiffness * farthest
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
-        wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
+        noise = terms
+        if robot.orbit:
+            noise = terms + rounding
+        wanted[np.abs(wanted) <= noise] = 0.0
         if spun:
             wheels = np.array([6 + robot.joint_names.index(name) for name in lin.wheels])
             others = _without_wheels(M, wheels)
@@ -467,7 +494,8 @@ def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Arra
         pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
         u = np.zeros(len(u))
         u[pushing] = _pseudo_solve(C[:, pushing], d)
-        u = bounded if (u[one_sided] < 0.0).any() else u
+        if (u[one_sided] < 0.0).any():
+            u = bounded
     return u, C @ u - d
 
 
@@ -535,10 +563,13 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
         """Show a table with one row for each group of four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
-            said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
-            growth = float(one.poles.real.max()) if one.stable is False else 0.0
+            stability = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
             sizes = [f"{moment:.5g}" for moment in one.moments]
-            rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
+            rate = 0.0
+            if one.stable is False:
+                rate = float(one.poles.real.max())
+            growth = f"{rate:.4g}" if rate else "."
+            rows.append([*sizes, stability, growth])
         return (
             f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
         )
@@ -619,14 +650,14 @@ def relative_equilibria(
             "axis"
         )
     n = mean_motion(robot)
-    found = []
+    equilibria = []
     field = OrbitField(robot, frame_of(robot, frame))
     rounding = _ROUNDING * (sizes[2] / sizes[0]) ** 2
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        own = axes[:, order] * signs
-        if np.linalg.det(own) < 0.0:
+        principal_axes = axes[:, order] * signs
+        if np.linalg.det(principal_axes) < 0.0:
             continue
-        R = field.axes @ own.T
+        R = field.axes @ principal_axes.T
         at = q.copy()
         moments = sizes[list(order)]
         at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
@@ -638,11 +669,14 @@ def relative_equilibria(
         # To avoid cancellation, compute the root `larger` of larger magnitude first. The
         # other root is c / larger.
         apart = np.sqrt(complex(b * b - 4.0 * c))
-        larger = -0.5 * (b + (apart if b >= 0.0 else -apart))
-        squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
+        if b < 0.0:
+            apart = -apart
+        larger = -0.5 * (b + apart)
+        smaller = c / larger if larger else 0.0
+        squares = np.array([-pitch, larger, smaller], dtype=complex)
         roots = n * np.sqrt(squares)
         poles = np.column_stack((roots, -roots)).ravel()
         margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
-        found.append(RelativeEquilibrium(at, moments, poles, stable, margin))
-    return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
+        equilibria.append(RelativeEquilibrium(at, moments, poles, stable, margin))
+    return RelativeEquilibria(sorted(equilibria, key=lambda one: (-one.margin, *one.moments)))

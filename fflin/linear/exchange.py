@@ -138,29 +138,36 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     step = step_of(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform its continuous-time model instead")
-    lin, (kind, own, to, rates) = whole, _jacobians_at(robot, whole, tool)
-    A, B = transformed(own, to, lin.A, lin.B)
+    lin, (kind, source, to, rates) = whole, _jacobians_at(robot, whole, tool)
+    A, B = transformed(source, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
     rate: Array = to.P @ rates
-    x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
+    position = np.zeros(len(v)) if kind.tangent else q
+    x0 = np.concatenate((position, v))
     fields: dict[str, Any] = {"C": np.eye(len(A)), "D": np.zeros(B.shape), "y0": x0}
     outputs = states
     if lin.output_names != lin.state_names:
-        D = lin.D @ np.linalg.inv(own.V)
-        fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
+        D = lin.D @ np.linalg.inv(source.V)
+        fields = {
+            "C": (lin.C @ source.P + D @ (to.H - source.H)) @ to.left,
+            "D": D @ to.V,
+            "y0": lin.y0,
+        }
         outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
         A, B, rate = euler_step(A, B, rate, step, tool)
-    f0: Array = rate * (not lin.moving)
+    f0: Array = rate
+    if lin.moving:
+        f0 = 0.0 * rate
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
     inputs = {kind.actuation.names[i]: kind.actuation.units[i] for i in kind.inputs}
     for signal, units in (("state", states), ("input", inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
-    T_u = np.linalg.solve(to.V, own.V)
+    T_u = np.linalg.solve(to.V, source.V)
     about = "moving" if lin.moving else "fixed"
-    fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
+    fields |= {"q": q, "v": v, "T": to.P @ source.left, "T_left": source.P @ to.left, "T_u": T_u}
     fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
     return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
 
@@ -199,11 +206,11 @@ def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     model = lin.to(tool)
     whole = lin.generator
     assert whole is not None and lin._robot is not None
-    _, own, to, _ = _jacobians_at(lin._robot, whole, tool)
+    _, source, to, _ = _jacobians_at(lin._robot, whole, tool)
     # The input axes of the tool may rotate relative to the input axes of the model. In this case,
     # an input that is constant in the model's axes varies with the attitude in the tool's axes
     # (15.4).
-    turned = np.linalg.solve(to.V, (to.H - own.H) @ to.left)
+    turned = np.linalg.solve(to.V, (to.H - source.H) @ to.left)
     return ToolGain(model.T_u @ K @ model.T_left + turned, model, verified=lin.verified)
 
 
@@ -270,13 +277,14 @@ def from_tool(
     lin, step = about(), step_of(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
-        _, own, to, _ = _jacobians_at(robot, lin, tool)
-        lin = about(np.linalg.solve(own.V, to.V @ u))
+        _, source, to, _ = _jacobians_at(robot, lin, tool)
+        lin = about(np.linalg.solve(source.V, to.V @ u))
     if A is None and B is None:
         return lin
-    _, own, to, rates = _jacobians_at(robot, lin, tool)
-    ours = transformed(own, to, lin.A, lin.B)
-    ours = euler_step(*ours, to.P @ rates, step, tool)[:2] if step else ours
+    _, source, to, rates = _jacobians_at(robot, lin, tool)
+    ours = transformed(source, to, lin.A, lin.B)
+    if step:
+        ours = euler_step(*ours, to.P @ rates, step, tool)[:2]
     changes = []
     for name, given, expected in zip("AB", (A, B), ours, strict=True):
         change = expected if given is None else shaped(name, given, expected.shape)
@@ -285,12 +293,15 @@ def from_tool(
             nv = len(change) // 2
             change = np.vstack((0.0 * change[:nv], change[nv:] / step))
         changes.append(change)
-    own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
-    found = []
-    for old, new in zip((lin.A, lin.B), transformed(to, own, *changes), strict=True):
+    source, to = (
+        jacobians._replace(rate=0.0 * jacobians.rate, extra=0.0 * jacobians.extra)
+        for jacobians in (source, to)
+    )
+    matrices = []
+    for old, new in zip((lin.A, lin.B), transformed(to, source, *changes), strict=True):
         noise = (old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max())
-        found.append(np.where(noise, 0.0, old + new))
-    return replace(lin, A=found[0], B=found[1])
+        matrices.append(np.where(noise, 0.0, old + new))
+    return replace(lin, A=matrices[0], B=matrices[1])
 
 
 def _jacobians_at(
@@ -300,15 +311,20 @@ def _jacobians_at(
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin lacks some states of the robot; use the full model of the robot")
-    own = ToolCoordinates(state, moving=lin.moving)
+    coordinates = ToolCoordinates(state, moving=lin.moving)
     kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu = state.velocities(lin.v)
     rates = lin.drift
-    point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+    point = lin.q, nu, coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
     if rates is None:  # f0 = P dy/dt
-        rates = own.jacobians(*point, 0.0 * nu).left @ lin.f0
+        rates = coordinates.jacobians(*point, 0.0 * nu).left @ lin.f0
     rates = rates[len(nu) :]
-    return kind, own.jacobians(*point, rates), kind.jacobians(*point, rates), np.append(nu, rates)
+    return (
+        kind,
+        coordinates.jacobians(*point, rates),
+        kind.jacobians(*point, rates),
+        np.append(nu, rates),
+    )
 
 
 def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:

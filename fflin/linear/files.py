@@ -57,13 +57,13 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "drift": ("drift",),
     "limits": ("limit",),
 }
-_NAMES = [f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS]
+_NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
 _LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names")
 _OPTIONAL = ("wheels",)  # lists that files of earlier versions lack
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _FIGURES = ("dt", "moving", "mean_motion")
 
-_MATRICES = [key for key, of in _ARRAYS.items() if len(of) == 2]
+_MATRICES = [key for key, dimensions in _ARRAYS.items() if len(dimensions) == 2]
 
 T = TypeVar("T")
 
@@ -99,11 +99,11 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
     names["velocity"] = names["state"][-len(entries["M"]) :]
     rest, tables = dict(entries), dict[str, list[list[object]]]()
     for key in _MATRICES:
-        rows, columns = (names[each] for each in _ARRAYS[key])
+        rows, columns = (names[dimension] for dimension in _ARRAYS[key])
         body = zip(rows, rest.pop(key).tolist(), strict=True)
         tables[key] = [["", *columns], *([name, *row] for name, row in body)]
     for signal in _SIGNALS:
-        vectors = [key for key, of in _ARRAYS.items() if of == (signal,)]
+        vectors = [key for key, dimensions in _ARRAYS.items() if dimensions == (signal,)]
         keys = (f"{signal}_names", f"{signal}_units", *vectors)
         columns = [np.asarray(rest.pop(key)).tolist() for key in keys]
         lines = zip(*columns, strict=True)
@@ -135,7 +135,7 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
             array = np.array(entries[key], dtype=float)
             if not np.isfinite(array).all():
                 raise ValueError(f"{key} has entries that are not finite")
-            fields[key] = frozen(array.reshape([sizes[each] for each in dimensions]))
+            fields[key] = frozen(array.reshape([sizes[dimension] for dimension in dimensions]))
         fields["weights"] = weights = json.loads(fields["weights"])
         if not isinstance(weights, dict) or not all(
             isinstance(x, dict | str) for x in weights.values()
@@ -167,9 +167,10 @@ def foreign_table(path: Path) -> Path | None:
     exists.
     """
     info = _csv_path(path, "info")
-    own = info.is_file() and b"\nurdf_sha256," in info.read_bytes()
+    if info.is_file() and b"\nurdf_sha256," in info.read_bytes():
+        return None
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
-    tables = [] if own else [_csv_path(path, key) for key in keys]
+    tables = [_csv_path(path, key) for key in keys]
     return next((table for table in tables if table.is_file() and table.stat().st_size), None)
 
 
@@ -219,9 +220,12 @@ def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dic
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # a MATLAB struct
     with located(str(source)):
-        entries = _entries(entries, robot) if table else entries
-        hold = hold or (text(entries["hold"]) if "hold" in entries else None)
-        frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
+        if table:
+            entries = _entries(entries, robot)
+        if not hold:
+            hold = text(entries["hold"]) if "hold" in entries else None
+        if not frame:
+            frame = text(entries["frame"]) if "frame" in entries else "local"
         return arguments(entries, robot, hold, frame, verified)
 
 
@@ -234,9 +238,9 @@ def arguments(
     """
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
-        found = ", ".join(sorted(entries))
+        entry_names = ", ".join(sorted(entries))
         raise FileError(
-            f"the file has the entries {found}; expected t, u, and either x or both q and v"
+            f"the file has the entries {entry_names}; expected t, u, and either x or both q and v"
         )
     t = as_double("t", entries["t"]).ravel()
     pose = as_double("placement", entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0]))
@@ -245,18 +249,24 @@ def arguments(
     reference = pin.XYZQUATToSE3(np.concatenate((pose[:3], quaternion)))
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
     actuation, u = Actuation(state), as_double("u", entries["u"])
-    u = u[:, None] if u.ndim == 1 else u
+    if u.ndim == 1:
+        u = u[:, None]
     if u.ndim != 2:
         raise InputError(f"u has shape {u.shape}, expected one row of inputs for each knot")
     names = actuation.names
-    there = texts(entries.get("input_names", actuation.names))
-    if names != there or u.shape[-1] != len(names):
-        lacking, other = ([n for n in a if n not in b] for a, b in ((names, there), (there, names)))
-        said = f"; it lacks the inputs {listed(lacking)}" if lacking else ""
-        said += f"; it has the other inputs {listed(other)}" if other else ""
+    file_names = texts(entries.get("input_names", actuation.names))
+    if names != file_names or u.shape[-1] != len(names):
+        lacking, other = (
+            [n for n in a if n not in b] for a, b in ((names, file_names), (file_names, names))
+        )
+        details = ""
+        if lacking:
+            details += f"; it lacks the inputs {listed(lacking)}"
+        if other:
+            details += f"; it has the other inputs {listed(other)}"
         raise InputError(
             f"the file has {u.shape[-1]} inputs, expected one for each input of the robot, in the "
-            f"order {listed(names)}{said}; load the robot with the inputs of the trajectory "
+            f"order {listed(names)}{details}; load the robot with the inputs of the trajectory "
             "(--inputs)"
         )
     for columns in actuation.held:
@@ -309,7 +319,8 @@ def _entries(columns: Record, robot: Robot) -> Record:
     state = StateMap(robot)
     inputs = Actuation(state).names
     rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
-    rows = rows if any(rows.values()) else {"x": list(state.names)}
+    if not any(rows.values()):
+        rows = {"x": list(state.names)}
     rows["t"] = ["t"]
     known = [name for names in rows.values() for name in names]
     require_known("column", known, columns)

@@ -53,12 +53,12 @@ def require_fit(
 
 def signals_of(state: StateMap, kind: str) -> Signals:
     """Return the names and units of a robot's signals; `kind` is "state", "input" or "output"."""
-    found: StateMap | Actuation | Sensing = state
+    source: StateMap | Actuation | Sensing = state
     if kind == "input":
-        found = Actuation(state)
+        source = Actuation(state)
     elif kind == "output" and state.robot.outputs != (FullState(),):
-        found = Sensing(state, state.robot.outputs)
-    return found.names, found.units
+        source = Sensing(state, state.robot.outputs)
+    return source.names, source.units
 
 
 def require_same(
@@ -80,16 +80,17 @@ def require_same(
     lacking = [n for n in mine if n not in others] or [n for n in others if n not in mine]
     changed = [name for name in mine if mine[name] != others.get(name)]
     if lacking:
-        said = "lacks" if lacking[0] in mine else "also has"
-        said += f" the {kind}{'s' * bool(lacking[1:])} {listed(lacking)}"
+        verb = "lacks" if lacking[0] in mine else "also has"
+        noun = kind if len(lacking) == 1 else f"{kind}s"
+        difference = f"{verb} the {noun} {listed(lacking)}"
     elif changed:
-        said = f"has its {kind} {changed[0]} in {others[changed[0]]}, not {mine[changed[0]]}"
+        difference = f"has its {kind} {changed[0]} in {others[changed[0]]}, not {mine[changed[0]]}"
     else:
-        said = f"has its {kind}s in another order"
+        difference = f"has its {kind}s in another order"
     subject = made.partition(" was ")[0]
     raise InputError(
-        f"{made}, but the given robot '{robot.name}' {said}; make {subject} again for the given "
-        "robot, or use Robot.replace to give the robot the same joints, inputs and outputs"
+        f"{made}, but the given robot '{robot.name}' {difference}; make {subject} again for the "
+        "given robot, or use Robot.replace to give the robot the same joints, inputs and outputs"
     )
 
 
@@ -202,22 +203,25 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
         raise InputError(f"gain has type {type(gain).__name__}, expected a Gain or GainBatch")
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     for key in ("frame", "dt"):
-        own, other = getattr(gain, key, lin.dt), getattr(lin, key)
-        if own != other:
+        gain_value, model_value = getattr(gain, key, lin.dt), getattr(lin, key)
+        if gain_value != model_value:
             raise InputError(
-                f"the {key} of the gain is {own}, but the {key} of the model is {other}; give "
-                f"both the same {key}"
+                f"the {key} of the gain is {gain_value}, but the {key} of the model is "
+                f"{model_value}; give both the same {key}"
             )
     selections = []
     for kind in ("input", "state"):
-        own, other = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
-        lacking, beside = [n for n in own if n not in other], [n for n in other if n not in own]
+        gain_names, model_names = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
+        lacking, beside = (
+            [n for n in gain_names if n not in model_names],
+            [n for n in model_names if n not in gain_names],
+        )
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "
                 f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
                 f"the model or the gain must have all {kind}s of the other"
             )
-        selections.append(np.array([[float(a == b) for b in own] for a in other]))
+        selections.append(np.array([[float(a == b) for b in gain_names] for a in model_names]))
     of_inputs, of_states = selections
     return np.asarray(of_inputs @ gain.K @ of_states.T)

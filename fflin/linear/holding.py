@@ -51,10 +51,14 @@ def held(lin: LinearModel) -> LinearModel:
     if len(source.A) != 2 * robot.nv:
         return lin
     frame = frame_of(robot, source.frame)
-    reference = source.reference if robot.orbit or source.x0[:6].any() else None
-    found = equilibrium(robot, source.q, v=source.v, frame=frame, reference=reference)
-    model = linearize(robot, found.q, source.v, found.u, frame=frame, reference=reference)
-    return model.discretize(lin.dt) if lin.dt else model
+    reference = None
+    if robot.orbit or source.x0[:6].any():
+        reference = source.reference
+    balanced = equilibrium(robot, source.q, v=source.v, frame=frame, reference=reference)
+    model = linearize(robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference)
+    if lin.dt:
+        return model.discretize(lin.dt)
+    return model
 
 
 def held_if_possible(lin: LinearModel) -> LinearModel:
@@ -107,13 +111,13 @@ def wheel_notes(lin: LinearModel) -> tuple[str, ...]:
     normal = (lin.reference.rotation @ turn).T @ np.array(_NORMAL[lin.frame])
     parts = float(rate @ normal) * normal, rate - float(rate @ normal) * normal
     along, across = (float(np.linalg.norm(part)) for part in parts)
-    said = list[str]()
+    gains = list[str]()
     if along > TOLERANCE * torque:
         gained = along * 2.0 * math.pi / n
-        said.append(f"{gained:.3g} N m s per orbit along the orbit normal")
+        gains.append(f"{gained:.3g} N m s per orbit along the orbit normal")
     if across > TOLERANCE * torque:
-        said.append(
+        gains.append(
             f"up to {2.0 * across / n:.3g} N m s across the orbit normal, which returns to zero "
             "after each orbit"
         )
-    return (f"{head}: they gain {' and '.join(said)}",)
+    return (f"{head}: they gain {' and '.join(gains)}",)

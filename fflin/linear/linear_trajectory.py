@@ -93,9 +93,10 @@ class LinearTrajectory(Trajectory):
         """Return the linear model at the knot with the given index."""
         k = range(len(self))[index]
         lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
-        own = {name: getattr(self, name)[k] for name in "ABCD"}
-        lin = lin.discretize(self.dt) if self.dt else lin
-        return replace(lin, **own, y0=self.y[k], verified=self.verified)
+        matrices = {name: getattr(self, name)[k] for name in "ABCD"}
+        if self.dt:
+            lin = lin.discretize(self.dt)
+        return replace(lin, **matrices, y0=self.y[k], verified=self.verified)
 
     def __iter__(self) -> Iterator[LinearModel]:
         return map(self.__getitem__, range(len(self)))
@@ -112,12 +113,13 @@ class LinearTrajectory(Trajectory):
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
         k, s = intervals_of(self.t, times)
-        s = s * (not self.dt)
+        if self.dt:
+            s = 0.0 * s
         inside, knot = (s > 0.0) & (s < 1.0), k + (s == 1.0)
         A, B = self.A[knot], self.B[knot]
         if inside.any():
-            found = self._linearizer.along(*self.points(times[inside]))
-            A[inside], B[inside] = found["A"], found["B"]
+            models = self._linearizer.along(*self.points(times[inside]))
+            A[inside], B[inside] = models["A"], models["B"]
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
@@ -127,8 +129,8 @@ class LinearTrajectory(Trajectory):
         """
         (k,), (fraction,) = intervals_of(self.t, np.array([self._within(t)]))
         if self.dt or not fraction:
-            return tuple(each[k] for each in arrays)
-        return tuple(each[k] + fraction * (each[k + 1] - each[k]) for each in arrays)
+            return tuple(array[k] for array in arrays)
+        return tuple(array[k] + fraction * (array[k + 1] - array[k]) for array in arrays)
 
     def check(self, *, tolerance: float | None = None) -> Check:
         """Check the linear model at every knot by `fflin.check`, and return the largest errors.
@@ -162,9 +164,9 @@ class LinearTrajectory(Trajectory):
             If the duration is not a multiple of dt, or the model is already in discrete time.
         """
         refuse_sampled(self.dt, "discretize")
-        found = np.array([transition for _, transition in transitions(self, dt)])
+        maps = np.array([transition for _, transition in transitions(self, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
-        return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
+        return replace(models, A=maps[:, :nx, :nx], B=maps[:, :nx, nx:], dt=float(dt))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolTrajectory:
         """Return the models at all knots in the coordinates of another tool.
@@ -264,10 +266,10 @@ def linearize_trajectory(
 def along(motion: Trajectory) -> LinearTrajectory:
     """Return the error dynamics of a trajectory, linearised about all knots."""
     linearizer = Linearizer(motion.robot, moving=True)
-    found: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
+    fields: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
     for key in ("state_names", "input_names", "output_names"):
-        found[key] = linearizer.prepared.common[key]
-    made = LinearTrajectory._of(motion, **found, dt=0.0)
+        fields[key] = linearizer.prepared.common[key]
+    made = LinearTrajectory._of(motion, **fields, dt=0.0)
     for name in ("interval_errors", "cubics"):
         if name in vars(motion):  # keep cached results of the same motion
             vars(made)[name] = vars(motion)[name]
@@ -322,7 +324,7 @@ def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps
     """Yield the steps and the transition matrix of each sample, for the samples of `_through`."""
     for first in range(0, len(cuts), _BATCH):
         batch = cuts[first : first + _BATCH]
-        found = _through(traj, batch, 1)
+        samples = _through(traj, batch, 1)
         parts = 1
         pending = list(range(len(batch)))
         while pending and parts < _MOST_PARTS:
@@ -330,14 +332,14 @@ def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps
             coarse = pending
             finer = _through(traj, [batch[k] for k in coarse], parts)
             pending = []
-            for k, each in zip(coarse, finer, strict=True):
+            for k, sample in zip(coarse, finer, strict=True):
                 # Halving the steps divides the error by 16, so the remaining error is about 1/15 of
                 # the change. For a safety margin, the estimate is 1/4 of the change.
-                apart = np.abs(each[1] - found[k][1]).max(axis=0)
-                if not (0.25 * apart <= ACCURACY * np.abs(each[1]).max(axis=0)).all():
+                apart = np.abs(sample[1] - samples[k][1]).max(axis=0)
+                if not (0.25 * apart <= ACCURACY * np.abs(sample[1]).max(axis=0)).all():
                     pending.append(k)
-                found[k] = each
-        yield from found
+                samples[k] = sample
+        yield from samples
 
 
 def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
@@ -359,13 +361,13 @@ def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tupl
     h = np.repeat(0.5 * h, 2)
     heavy_light = np.stack((nodes, nodes[:, ::-1]), axis=2).reshape(-1, 2)
     maps = np.concatenate(held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1)
-    ends = np.cumsum([2 * len(each) for each in start])[:-1]
-    columns = [np.split(each, ends) for each in (mixed, h, maps, heavy_light)]
-    found = list[tuple[Steps, Array]]()
+    ends = np.cumsum([2 * len(times) for times in start])[:-1]
+    columns = [np.split(array, ends) for array in (mixed, h, maps, heavy_light)]
+    samples = list[tuple[Steps, Array]]()
     for row in zip(*columns, strict=True):
         steps = Steps(*row)
         whole = np.eye(nx + nu)
         for step in steps.maps:
             whole[:nx] = step @ whole
-        found.append((steps, whole[:nx]))
-    return found
+        samples.append((steps, whole[:nx]))
+    return samples

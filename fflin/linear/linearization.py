@@ -64,7 +64,8 @@ class Prepared:
         self.moving = truth("moving", moving)
         if moving:
             refuse_orbit(robot, "models with moving=True")
-        frame = "local" if moving and frame is None else frame
+        if moving and frame is None:
+            frame = "local"
         self.map = state = StateMap(robot, reference=reference, frame=frame)
         if moving and (reference is not None or state.frame != "local"):
             raise InputError(
@@ -106,8 +107,11 @@ class Prepared:
         if not self.own_reference:
             self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
-        for signal, of in signals:
-            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = of.names, of.units
+        for signal, source in signals:
+            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = (
+                source.names,
+                source.units,
+            )
         A = np.zeros((nx, nx))
         A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))  # N (2.1)
         self.rest: dict[str, Array] = {
@@ -120,15 +124,20 @@ class Prepared:
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
-        chart = _STANDING if self.own_reference else state.chart(q)
-        r_b = chart.q_b if self.own_reference else state.positions(q)
+        chart: Chart = _STANDING
+        r_b = chart.q_b
+        if not self.own_reference:
+            chart = state.chart(q)
+            r_b = state.positions(q)
         return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
     """Return the default reference: the base placement (7,) at the point of a model."""
     root, q = robot.model.jointPlacements[ROOT], lin.q[:7]
-    return q if root.isIdentity(0.0) else frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
+    if root.isIdentity(0.0):
+        return q
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q)))
 
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
@@ -137,9 +146,14 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     # position and the attitude of the base. For other robots, the position is ignorable, because
     # gravity is zero or uniform. If gravity is zero, the attitude relative to a moving reference
     # (`lin.moving`) is also ignorable.
-    groups = ["q_b", "r_b"] if lin.moving and not any(robot.gravity) else ["r_b"]
+    groups = list[str]()
+    if lin.moving and not any(robot.gravity):
+        groups.append("q_b")
+    groups.append("r_b")
+    if robot.orbit:
+        groups = []
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
-    return (*([] if robot.orbit else base), *(f"q_m.{name}" for name in robot.rotors))
+    return (*base, *(f"q_m.{name}" for name in robot.rotors))
 
 
 def wheels_of(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
@@ -305,14 +319,17 @@ class Linearizer:
         rates = self._accelerations.rates(q, v, nu, u_base, A[lower], B[lower])
         seen: dict[str, Array] = {}
         if ready.sensing is not None:
-            r_b = chart.q_b if ready.own_reference else state.positions(q)
+            r_b = chart.q_b
+            if not ready.own_reference:
+                r_b = state.positions(q)
             x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
             point = q, v, nu, u_base
             seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
             _require_finite(*seen.values())
         rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         _require_finite(A, B, rate)
-        rate = drift(state, rate, rates.gravity) if ready.moving else rate
+        if ready.moving:
+            rate = drift(state, rate, rates.gravity)
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
@@ -338,15 +355,15 @@ class Linearizer:
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
-                    here = _STANDING, rates, x0[k], point
-                    seen.append(output_equations(sensing, actuation, self._data, *here))
+                    measured_point = _STANDING, rates, x0[k], point
+                    seen.append(output_equations(sensing, actuation, self._data, *measured_point))
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
         f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0
         else:
-            C, D, y = (np.array([each[key] for each in seen]) for key in ("C", "D", "y0"))
+            C, D, y = (np.array([equations[key] for equations in seen]) for key in ("C", "D", "y0"))
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)
         return {"A": A, "B": B, "C": C, "D": D, "y": y}

@@ -267,7 +267,9 @@ class LinearModel(ModelHeader, StateSpace):
         if self.drift is not None:
             return self.drift
         source = self.generator
-        return self.f0 / self.dt if source is None else source.f0
+        if source is None:
+            return self.f0 / self.dt
+        return source.f0
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -293,7 +295,9 @@ class LinearModel(ModelHeader, StateSpace):
           carries no other link;
         - the base attitude, for `moving` models without gravity.
         """
-        return () if self._ignorable is None else self._ignorable(self)
+        if self._ignorable is None:
+            return ()
+        return self._ignorable(self)
 
     @cached_property
     def wheels(self) -> tuple[str, ...]:
@@ -321,7 +325,9 @@ class LinearModel(ModelHeader, StateSpace):
         ``qdot_m`` is the largest speed [rad/s | m/s]. The limit of a joint position in ``q_m`` is
         the difference between its upper and lower limits [rad | m].
         """
-        return {} if self._limits is None else self._limits()
+        if self._limits is None:
+            return {}
+        return self._limits()
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Return whether the operating point is a fixed point or a relative equilibrium.
@@ -415,7 +421,9 @@ class LinearModel(ModelHeader, StateSpace):
 
         self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)
-        return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
+        if self.dt:
+            return StateSpace(*matrices, dt=self.dt)
+        return StateSpace(*matrices)
 
     def to_control(self) -> ControlSystem:
         """Return the model of the deviations from x0 and u0 as a `control.StateSpace`.
@@ -478,22 +486,22 @@ def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
     kinds = ("states", "inputs", "outputs")
-    states, inputs, outputs = (_labels(*each) for each in zip(kinds, signals, strict=True))
+    states, inputs, outputs = (_labels(*group) for group in zip(kinds, signals, strict=True))
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 
 def _labels(kind: str, names: Sequence[str]) -> list[str]:
     """Return names for python-control, or raise `InputError` if two signals get the same name."""
-    found = dict[str, str]()
+    labels = dict[str, str]()
     for name in names:
         label = undotted(name)
-        if label in found:
+        if label in labels:
             raise InputError(
-                f"the {kind} '{found[label]}' and '{name}' both get the name '{label}' in "
+                f"the {kind} '{labels[label]}' and '{name}' both get the name '{label}' in "
                 "python-control, whose names contain no dots; rename one of them, such as its joint"
             )
-        found[label] = name
-    return list(found)
+        labels[label] = name
+    return list(labels)
 
 
 def refuse_sampled(dt: float, do: str) -> None:

@@ -101,7 +101,7 @@ class OutputReference:
         ny = len(lin.y0)
         is_curved = np.zeros(len(x), dtype=bool)
         is_curved[groups.q_b] = is_curved[groups.q_m] = True
-        here = self._evaluate(x[None], self._a)[0]
+        h = self._evaluate(x[None], self._a)[0]
         # h is linear in the accelerations, so its derivatives by velocities do not depend on them.
         # Without them, h is small, and so are its rounding errors.
         nv = len(x) // 2
@@ -121,15 +121,15 @@ class OutputReference:
         by_velocities = differences(slice(nv, None), steady)
         by_x, *again = np.concatenate((by_positions, by_velocities), axis=2)
 
-        parts = {k: np.arange(k, k + 3) for k in range(ny, len(here), 3)}
+        parts = {k: np.arange(k, k + 3) for k in range(ny, len(h), 3)}
         vectors = {**self._vectors, **parts}
-        ones = np.ones(len(here))
+        ones = np.ones(len(h))
         places = [lin.reference, *state.robot.model.jointPlacements.tolist()]
         reach = sum(float(np.linalg.norm(place.translation)) for place in places)
         reach += float(np.linalg.norm(lin.q[:3]))
         least = {"rad": 1.0, "1": 1.0, "m": reach}
         moved = np.abs(by_x) * np.abs(x)
-        whole = np.abs(here) + moved.sum(axis=1)
+        whole = np.abs(h) + moved.sum(axis=1)
         sizes = np.column_stack((whole, np.abs(unaccelerated) + moved[:, nv:].sum(axis=1)))
         sizes[:ny] += np.array([least.get(unit, 0.0) for unit in lin.output_units])[:, None]
         sizes = spread_over(vectors, sizes, ones)
@@ -139,13 +139,14 @@ class OutputReference:
         # that the joint moves is measured.
         per_unit = np.zeros(by_x.shape)
         per_unit[:, groups.q_b] = 2.0
-        per_unit[:, groups.r_b] = 1.0 / reach if reach else 0.0
+        if reach:
+            per_unit[:, groups.r_b] = 1.0 / reach
         per_joint = [body.scale for body in state.robot.joints]
-        per_unit[:, groups.q_m] = _moved_by(state, len(here)) * per_joint
+        per_unit[:, groups.q_m] = _moved_by(state, len(h)) * per_joint
         by_column = np.repeat(sizes, nv, axis=1)
         rounding = FEW_ULPS * EPS * by_column * (depends / steps + per_unit)
         rounding += sampled(vectors, by_x, again, ones)
-        total = self._bodies.sums(here, ny, self._kinds, lin.reference.rotation)
+        total = self._bodies.sums(h, ny, self._kinds, lin.reference.rotation)
         size = np.abs(total)
         return total @ by_x, size @ rounding, size @ sizes[:, 0]
 
@@ -231,16 +232,16 @@ class _Bodies:
         angular = (R @ spin[..., None])[..., 0] + np.cross(center, momentum)
         return np.hstack((body.mass / self._total * center, momentum, angular)).ravel()
 
-    def sums(self, here: Array, ny: int, kinds: dict[str, list[int]], reference: Array) -> Array:
+    def sums(self, h: Array, ny: int, kinds: dict[str, list[int]], reference: Array) -> Array:
         """Return the matrix (ny, ..) that sums the contributions of the bodies.
 
-        `here` are the outputs (ny,) and the contributions at the operating point. The matrix maps
+        `h` contains the outputs (ny,) and the contributions at the operating point. The matrix maps
         the derivatives of both to the derivatives of the outputs.
         """
-        total = np.eye(ny, len(here))
+        total = np.eye(ny, len(h))
         if not self._summed:
             return total
-        center, momentum, _ = here[ny:].reshape(-1, 3, 3).sum(axis=0)
+        center, momentum, _ = h[ny:].reshape(-1, 3, 3).sum(axis=0)
         count = len(self._body.mass)
         unit, none = np.eye(3), np.zeros((3, 3))
 
@@ -277,7 +278,7 @@ def _moved_by(state: StateMap, count: int) -> Mask:
     for output in robot.outputs:
         size = len(output.signals) or len(state_indices(state, output))
         carriers = [find_frame(model, name).joint for name in output.frames]
-        moved = [any(each) for each in zip(*map(movers, carriers), strict=True)]
+        moved = [any(flags) for flags in zip(*map(movers, carriers), strict=True)]
         rows += [moved or [False] * robot.n] * size
     if count > len(rows):
         for carrier in range(model.njoints):

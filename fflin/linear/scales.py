@@ -76,11 +76,11 @@ def spread_over(rows: Blocks, x: Array, row_units: Array) -> Array:
 
     `row_units` (k,) are the units in which the entries of a row are compared with other rows.
     """
-    found = np.zeros_like(x)
+    largest = np.zeros_like(x)
     for at in rows.values():
         unit = row_units[at][:, None]
-        found[at] = unit * (np.abs(x[at]) / unit).max(axis=0, initial=0.0)
-    return found
+        largest[at] = unit * (np.abs(x[at]) / unit).max(axis=0, initial=0.0)
+    return largest
 
 
 def block_sizes(

@@ -54,7 +54,8 @@ def assemble(
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
             # Add N W J. At the reference, N W J is W, because N = E/2 and J = 2 E.
-            by_q_b += W if chart.standing else chart.over_q_b(product(chart.N, W))
+            by_turn = W if chart.standing else chart.over_q_b(product(chart.N, W))
+            by_q_b += by_turn
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
         # Q R^T = Q^T.
@@ -67,7 +68,8 @@ def assemble(
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         # The columns of the base's linear velocity need no rotation: before (4.5) below, these
         # columns are zero.
-        chart.turn_rows((ANGULAR,) if omega_in_reference else (), rates.by_nu.mT)
+        if omega_in_reference:
+            chart.turn_rows((ANGULAR,), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)
     if state.falls:
@@ -106,8 +108,9 @@ def _over_rotations(
     theta, c = rates.by_turn, rates.c
     if omega_in_reference:
         theta = product(rates.by_nu[..., ANGULAR], W)
-    for columns in actuation.held if np.count_nonzero(u) else ():
-        theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
+    if np.count_nonzero(u):
+        for columns in actuation.held:
+            theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
     # `turning` and `shifting` are views of the angular and the linear rows of theta. Subtracting
     # from a view is faster than `theta[rows] -= y`, which also copies the result back into theta.
     turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
@@ -128,7 +131,9 @@ def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     f0 is the state derivative of the robot. Under gravity, the result is f0 without the rotation
     about the vertical, because a rotation about the vertical does not affect the dynamics.
     """
-    weight = (gravity * gravity).sum(axis=-1, keepdims=True) if state.falls else np.zeros(1)
+    if not state.falls:
+        return f0
+    weight = (gravity * gravity).sum(axis=-1, keepdims=True)
     if not np.count_nonzero(weight):
         return f0
     rate: Array = f0.copy()

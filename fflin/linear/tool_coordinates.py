@@ -71,7 +71,7 @@ class ToolCoordinates:
 
     def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
         robot = state.robot
-        own = not tool
+        is_fflin = not tool
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
         self.tangent = kind.attitude in ("tangent", "pose")
@@ -83,7 +83,7 @@ class ToolCoordinates:
         # X converts from the frame of the root link to the base frame of the tool. A displacement y
         # of the base becomes X y, a twist nu becomes X nu, and a wrench w becomes X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
-        followers = () if own else map(attrgetter("joint"), robot.followers)
+        followers = () if is_fflin else map(attrgetter("joint"), robot.followers)
         self.joints = sorted((*robot.joints, *followers), key=attrgetter("idx_v"))
         if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _joint_path(robot, joint.name))
@@ -104,7 +104,7 @@ class ToolCoordinates:
             )
         # `inputs` contains, for each input of the tool, the index of the same input of the robot.
         self.inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
-        if not own:
+        if not is_fflin:
             self.inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
@@ -113,15 +113,15 @@ class ToolCoordinates:
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
         kind = self.convention
-        found = dict[str, str]()
+        units = dict[str, str]()
         attitude = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
         omega = [f"{x}_rate" for x in attitude] if kind.rates else [f"omega.{x}" for x in "xyz"]
         pose, twist = [*attitude, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
         for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
             base = np.roll(names, self._roll).tolist()
-            found |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
-            found |= {f"{joint_name}.{j.name}": j.unit + angle[3:] for j in self.joints}
-        return found
+            units |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
+            units |= {f"{joint_name}.{j.name}": j.unit + angle[3:] for j in self.joints}
+        return units
 
     def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Convert a valid Pinocchio configuration and velocity to the tool's q and v."""
@@ -129,8 +129,13 @@ class ToolCoordinates:
             return q, v
         attitude, R = self._attitude(q)
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
-        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # R by columns
-        pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
+        if stored == "wxyz":
+            attitude = np.roll(attitude, 1)
+        elif stored == "euler":
+            attitude = _angles(R)
+        else:
+            attitude = R.T.ravel()  # R by columns
+        pose = np.concatenate((attitude, at.translation))
         turned = self._rotated(R, rates=self.convention.rates)
         twist = turned @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
@@ -180,8 +185,10 @@ class ToolCoordinates:
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
         quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
-            quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
-            quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
+            if quaternion[3] < 0.0:
+                quaternion *= -1.0
+            if self._moving:
+                quaternion = np.array((0.0, 0.0, 0.0, 1.0))
         return quaternion, rotation_matrix(quaternion)
 
     def _rotated(self, R: Array, *, rates: bool = False) -> Array:
@@ -214,13 +221,15 @@ class ToolCoordinates:
         nv = 6 + len(self.joints)
         X = self._X
         kind = self.convention
-        here, R_now = self._attitude(q)
+        quaternion_now, R_now = self._attitude(q)
         # Take a complex step along the motion. If the reference moves with the robot, the attitude
         # error and the tangent vector of the pose stay zero, so they take no step.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
-        turns = 0.5 * product_matrix(here) @ np.append(twist.real[ANGULAR], 0.0)
-        quaternion = here + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+        turns = 0.5 * product_matrix(quaternion_now) @ np.append(twist.real[ANGULAR], 0.0)
+        quaternion = (
+            quaternion_now + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+        )
         R = rotation_matrix(quaternion)
         w = quaternion[3]
         vec = quaternion[:3]
@@ -249,7 +258,7 @@ class ToolCoordinates:
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
         extra = np.zeros((len(P), len(P)))
         if k == 7:
-            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(here, 1))
+            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(quaternion_now, 1))
         # Invert P block by block, so that its exact zeros remain exact.
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
@@ -299,12 +308,15 @@ def _joint_path(robot: Robot, name: str) -> list[int]:
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
         name, at = frames[at].name, frames[at].parentFrame
-        path.insert(0, order.index(name) if name in order else len(order))
+        index = order.index(name) if name in order else len(order)
+        path.insert(0, index)
     return path
 
 
 def _left(P: Array) -> Array:
-    return np.asarray(np.linalg.inv(P) if len(P) == len(P.T) else np.linalg.solve(P.T @ P, P.T))
+    if len(P) == len(P.T):
+        return np.asarray(np.linalg.inv(P))
+    return np.asarray(np.linalg.solve(P.T @ P, P.T))
 
 
 def _angles(R: Array) -> Array:

@@ -126,10 +126,10 @@ class _Change:
                 f"tool is '{tool}', expected {' or '.join(ALONG)}, whose errors along a trajectory "
                 "are in base axes; convert a model at one knot with along[k].to(tool)"
             )
-        own = ToolCoordinates(StateMap(robot, frame="local"), moving=True)
+        coordinates = ToolCoordinates(StateMap(robot, frame="local"), moving=True)
         nu = np.zeros(6 + robot.n)
-        point = robot.neutral(), nu, np.zeros(len(own.actuation.names)), nu
-        source, to = own.jacobians(*point), kind.jacobians(*point)
+        point = robot.neutral(), nu, np.zeros(len(coordinates.actuation.names)), nu
+        source, to = coordinates.jacobians(*point), kind.jacobians(*point)
         self.T, self.T_left = to.P @ source.left, source.P @ to.left
         self.T_u = np.linalg.solve(to.V, source.V)
 
@@ -148,8 +148,8 @@ def tool_trajectory(traj: LinearTrajectory, tool: str, dt: float | None) -> Tool
     B = change.T @ traj.B @ np.linalg.inv(change.T_u)
     if step:
         rates = np.hstack((traj.v, traj.accelerations()))
-        stepped = [euler_step(*each, step, tool)[:2] for each in zip(A, B, rates, strict=True)]
-        A, B = (np.array(each) for each in zip(*stepped, strict=True))
+        stepped = [euler_step(*knot, step, tool)[:2] for knot in zip(A, B, rates, strict=True)]
+        A, B = (np.array(matrices) for matrices in zip(*stepped, strict=True))
     return ToolTrajectory(
         tool=tool,
         robot=traj.robot.name,

@@ -145,7 +145,8 @@ class Trajectory(Design):
         v, u = as_double("v", self.v), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
-        u = np.vstack((u, u[-1:])) if short else u
+        if short:
+            u = np.vstack((u, u[-1:]))
         for name, rows, size, more in (("v", v, robot.nv, ""), ("u", u, nu, hint)):
             if rows.shape != (count, size):
                 raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
@@ -155,7 +156,8 @@ class Trajectory(Design):
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
         values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
-        values["hold"] = self.hold or ("previous" if short else "linear")
+        default_hold = "previous" if short else "linear"
+        values["hold"] = self.hold or default_hold
         for name, value in values.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -168,8 +170,8 @@ class Trajectory(Design):
 
     def _report(self) -> str:
         """Return text about the trajectory: its largest residual, or why it is invalid."""
-        said = self._fault or f"residual {self.residual.max():.1e}"
-        return folded([repr(self), said, *self._note.splitlines()])
+        verdict = self._fault or f"residual {self.residual.max():.1e}"
+        return folded([repr(self), verdict, *self._note.splitlines()])
 
     @cached_property
     def _aba(self) -> Aba:
@@ -195,7 +197,9 @@ class Trajectory(Design):
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         charts = self._aba.state.charts
-        return self.actuation.in_base_axes(charts(q), u) if self.actuation.held else u
+        if not self.actuation.held:
+            return u
+        return self.actuation.in_base_axes(charts(q), u)
 
     @property
     def residual(self) -> Array:
@@ -206,8 +210,8 @@ class Trajectory(Design):
         knot, divided by the duration of the interval and by the largest rate of the motion. The
         residual of a knot is the larger error of its two adjacent intervals.
         """
-        found = self.interval_errors
-        larger: Array = np.maximum(np.append(found, 0.0), np.append(0.0, found))
+        errors = self.interval_errors
+        larger: Array = np.maximum(np.append(errors, 0.0), np.append(0.0, errors))
         return larger
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
@@ -238,7 +242,9 @@ class Trajectory(Design):
         The time is given by `fraction`, the elapsed fraction of each interval, from 0 to 1.
         """
         u: Array = self.u[k]
-        return u if self.hold == "previous" else u + fraction * (self.u[k + 1] - u)
+        if self.hold == "previous":
+            return u
+        return u + fraction * (self.u[k + 1] - u)
 
     def accelerations(self) -> Array:
         """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
@@ -414,14 +420,14 @@ class Trajectory(Design):
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
-        terms = [state.spread(self._aba.terms(*each)) for each in zip(q, v, u, strict=True)]
+        terms = [state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)]
         # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
         push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
         rotors = state.robot.rotors
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         speed = np.abs(v).max(axis=0)
-        for group in ([0, 1, 2], [3, 4, 5], *([each] for each in alone), others):
+        for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
             for x in (speed, push):
                 x[group] = x[group].max(initial=0.0) or 1.0
 
@@ -430,7 +436,7 @@ class Trajectory(Design):
             jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
             return float(np.maximum(miss, jump).max())
 
-        found = []
+        errors = []
         steps = 1
         model = self.robot.model
         # If the knots are not a motion of the robot, the integration may overflow. The error of the
@@ -447,8 +453,8 @@ class Trajectory(Design):
                     change = size(apart, end[1] - before[1], h)
                     if change <= _ACCURACY or not np.isfinite(change):
                         break
-                found.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
-        return np.where(np.isfinite(found), found, np.inf)
+                errors.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
+        return np.where(np.isfinite(errors), errors, np.inf)
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
@@ -497,8 +503,9 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     if rows.shape == (count, robot.nq):
         return rows
     if rows.shape != narrow:
-        hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
-        hint = hint if len(cosines) else ""
+        hint = ""
+        if len(cosines):
+            hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
         raise InputError(f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}")
     wide = np.empty((count, robot.nq))
     wide[:, np.delete(np.arange(robot.nq), cosines + 1)] = rows
@@ -558,4 +565,4 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
     u = values["u"]
     u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
     smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
-    return min(held, smooth, key=lambda each: float(each.residual.max()))
+    return min(held, smooth, key=lambda trajectory: float(trajectory.residual.max()))

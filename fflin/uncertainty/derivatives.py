@@ -17,7 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Standing
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Chart, Standing
 from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
@@ -68,9 +68,11 @@ class ModelDerivatives:
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
         self.lin, self.robot, self._source = lin, robot, source  # `source` is in continuous time
-        own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin)))
-        own = own and robot.orbit is None
-        reference = None if own else lin.reference
+        default_reference = lin.moving or bool(
+            np.array_equal(lin.placement, own_reference(robot, lin))
+        )
+        default_reference = default_reference and robot.orbit is None
+        reference = None if default_reference else lin.reference
         self._prepare = partial(Prepared, frame=lin.frame, reference=reference, moving=lin.moving)
         self._ready = self._prepare(robot)
         state = self._ready.map
@@ -78,7 +80,9 @@ class ModelDerivatives:
         data = robot.create_data()
         self._state = state
         self._data = robot.create_data()
-        self._chart = Standing() if own else state.chart(lin.q)
+        self._chart: Chart = Standing()
+        if not default_reference:
+            self._chart = state.chart(lin.q)
         self._u, self._nu = actuation.in_base_axes(self._chart, lin.u0), state.velocities(lin.v)
         nv, nu = len(self._nu), len(self._u)
         self._inverse, slopes, by_u = (np.empty((nv, size)) for size in (nv, state.nx, nu))
@@ -89,8 +93,9 @@ class ModelDerivatives:
         # are set to zero; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
         self._q[:3] = self._v[:3] = 0.0
-        self._gradient = GravityGradient.at(state.field, lin.q) if state.field else None
-        if self._gradient:
+        self._gradient: GravityGradient | None = None
+        if state.field:
+            self._gradient = GravityGradient.at(state.field, lin.q)
             self._v[PIN_ANGULAR] += self._gradient.spin
         self._joints = range(ROOT, robot.model.njoints)
 
@@ -118,7 +123,7 @@ class ModelDerivatives:
         seen = self._seen(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
         f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
-        A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
+        A, B, f0 = (array[:-1] - array[-1] for array in (A, B, f0))
         if self.lin.dt:
             driven = np.column_stack((self._source.B, self._source.f0))
             given = np.concatenate((B, f0[..., None]), axis=2)
@@ -136,11 +141,11 @@ class ModelDerivatives:
         # is a quadratic function of the parameter, because `weighed` changes the accelerations
         # linearly. So three values at any step size give the exact derivative, see (12.2a).
         lin, now = self.lin, self._rates
-        found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
+        derivatives = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
         outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
         rows = [lin.output_names.index(name) for o in outputs for name, _ in o.signals]
         if not rows:
-            return found
+            return derivatives
         other = replace(self.robot, model=self.robot.model.copy())
         ready = self._prepare(other)
         sensing, actuation = ready.sensing, ready.actuation
@@ -148,9 +153,9 @@ class ModelDerivatives:
         data = other.create_data()
         point = (lin.q, lin.v, self._nu, self._u)
 
-        def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:
+        def weighed(one: Parameter, slopes: Sequence[Array], size: float) -> Array:
             change_bodies(other.model, self.robot.model, one, size)
-            changed = [a + size * b for a, b in zip(now, by, strict=True)]
+            changed = [a + size * b for a, b in zip(now, slopes, strict=True)]
             moved = AccelerationDerivatives(*changed)
             made = output_equations(sensing, actuation, data, self._chart, moved, lin.x0, point)
             seen: Array = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
@@ -161,12 +166,16 @@ class ModelDerivatives:
 
         total = pin.computeTotalMass(self.robot.model)
         for row, one in enumerate(parameters):
-            step = 1.0 / (self.fraction(one.bodies) or 1.0) if one.bodies else 1.0
+            step = 1.0
+            if one.bodies:
+                step = 1.0 / (self.fraction(one.bodies) or 1.0)
             mass = sum(change[0] for change in one.bodies.values())
-            of = [weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)]
-            derivative = (4.0 * of[1] - of[2] - 3.0 * of[0]) / (2.0 * step)
-            found[row, rows] = (derivative - mass * of[0] / total) / total
-        return found
+            values = [
+                weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)
+            ]
+            derivative = (4.0 * values[1] - values[2] - 3.0 * values[0]) / (2.0 * step)
+            derivatives[row, rows] = (derivative - mass * values[0] / total) / total
+        return derivatives
 
     def difference(self, one: Parameter) -> float:
         """Return the larger relative error of dA and dB, from finite differences of order 4."""
@@ -184,7 +193,9 @@ class ModelDerivatives:
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
             route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
-            return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
+            if lin.dt:
+                return held_exponential(*route[:2], lin.dt)
+            return route[:2]
 
         (dA, dB, *_), worst = self.over([one]), 0.0
         values = zip(*map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True)
@@ -204,7 +215,7 @@ class ModelDerivatives:
         rates = self._rates
         by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
         count = by_u.shape[:2]
-        found = AccelerationDerivatives(
+        derivatives = AccelerationDerivatives(
             np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
         )
         if self._v.any() or rates.c.any():
@@ -225,14 +236,14 @@ class ModelDerivatives:
                 for kept, values in zip(forces, zip(*of_bodies, strict=True), strict=True):
                     kept.append(np.tensordot(_OF_BODIES, values, 1))
             F, F_q, F_nu, F_turn = map(np.array, forces)
-            found.c[:] = -F @ self._inverse
+            derivatives.c[:] = -F @ self._inverse
             for body, at in np.ndindex(count):
-                F_q[body, at] += self._by_acceleration(found.c[body, at])
-            found.by_q_m[:] -= self._inverse @ F_q
-            found.by_nu[:] -= self._inverse @ F_nu
-            found.by_turn[:] -= self._inverse @ F_turn
-        found.by_nu[..., LINEAR] = 0.0
-        return found
+                F_q[body, at] += self._by_acceleration(derivatives.c[body, at])
+            derivatives.by_q_m[:] -= self._inverse @ F_q
+            derivatives.by_nu[:] -= self._inverse @ F_nu
+            derivatives.by_turn[:] -= self._inverse @ F_turn
+        derivatives.by_nu[..., LINEAR] = 0.0
+        return derivatives
 
     def fraction(self, changes: Mapping[int, Array]) -> float:
         """Return the relative size of a change dM of M: the spectral radius of M^-1 dM.
@@ -316,13 +327,13 @@ class ModelDerivatives:
                 pushed = pin.StdVec_Force(self.robot.model.njoints, pin.Force.Zero())
                 pushed[joint] = pin.Force(wrench * u[column])
                 F_q = self._by_acceleration(np.zeros(size), pushed)
-        found = AccelerationDerivatives(
+        derivatives = AccelerationDerivatives(
             -self._inverse @ F, np.zeros((size, 2 * size)), self._inverse @ B, np.zeros(3)
         )
-        if found.c.any():
-            F_q = F_q + self._by_acceleration(found.c)
-        found.by_q_m[:], found.by_nu[:] = -self._inverse @ F_q, -self._inverse @ F_nu
-        return found
+        if derivatives.c.any():
+            F_q = F_q + self._by_acceleration(derivatives.c)
+        derivatives.by_q_m[:], derivatives.by_nu[:] = -self._inverse @ F_q, -self._inverse @ F_nu
+        return derivatives
 
 
 def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:

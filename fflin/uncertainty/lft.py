@@ -115,11 +115,12 @@ class LFT(Design):
         columns = self.parameters, self.units, self.middle, self.half, self.repeats
         for name, unit, middle, half, repeats in zip(*columns, strict=True):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
-            rows.append((name, "." if unit == "1" else unit, *ends, f"{repeats:g}"))
+            shown_unit = "." if unit == "1" else unit
+            rows.append((name, shown_unit, *ends, f"{repeats:g}"))
         many = counted(len(self.repeats), "parameter")
         count = f"{self.repeats.sum():g}"
-        said = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
-        return f"{folded([said])}\n\n{grid(cut(rows), 'll')}"
+        title = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
+        return f"{folded([title])}\n\n{grid(cut(rows), 'll')}"
 
     @property
     def dt(self) -> float:
@@ -221,7 +222,10 @@ class Block(NamedTuple):
     def values(self, value: float) -> dict[str, float]:
         """Return {parameter: value} for a given common value or common factor of the block."""
         delta = (value - self.middle) / self.half
-        return {each.parameter.name: each.middle + each.half * delta for each in self.ranges}
+        return {
+            interval.parameter.name: interval.middle + interval.half * delta
+            for interval in self.ranges
+        }
 
 
 # Largest number of signals that one parameter multiplies: 6 for a density.
@@ -232,7 +236,7 @@ def linear_fractional(
     lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
 ) -> LFT:
     """Return the LFT of a model about an operating point at rest, without steady forces."""
-    form = _Form(ready, lin, [each for block in blocks for each in block.ranges])
+    form = _Form(ready, lin, [interval for block in blocks for interval in block.ranges])
     # M contains products of the parameters of a link, such as mass and centre of mass. The damping
     # force of a mode contains the product of its frequency and damping ratio. Therefore all
     # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
@@ -253,12 +257,12 @@ def linear_fractional(
             form.add_piece(pieces[name], parts)
     taken = (np.arange(_MOST) < form.used[:, None]).ravel()
     ends = np.cumsum([len(block.ranges) for block in blocks])[:-1]
-    repeats = [float(each.sum()) for each in np.split(form.used, ends)]
+    repeats = [float(used.sum()) for used in np.split(form.used, ends)]
     # Solve the equation of motion for a, and eliminate a from z.
     (M, *others), (Z, *direct) = form.parts(form.force), form.parts(form.z[taken])
     others[2], direct[2] = others[2][:, taken], direct[2][:, taken]
-    x, u, w = (-np.linalg.solve(M, each) for each in others)
-    C1, D12, D11 = (d + Z @ each for d, each in zip(direct, (x, u, w), strict=True))
+    x, u, w = (-np.linalg.solve(M, matrix) for matrix in others)
+    C1, D12, D11 = (d + Z @ matrix for d, matrix in zip(direct, (x, u, w), strict=True))
     nv, ny, nw = len(x), len(lin.C), len(D11)
     return LFT._of(
         lin,
@@ -271,11 +275,11 @@ def linear_fractional(
         C2=np.array(lin.C),
         D21=np.zeros((ny, nw)),
         D22=np.array(lin.D),
-        parameters=tuple(each.name for each in blocks),
-        units=tuple(each.unit for each in blocks),
+        parameters=tuple(block.name for block in blocks),
+        units=tuple(block.unit for block in blocks),
         repeats=np.array(repeats),
-        middle=np.array([each.middle for each in blocks]),
-        half=np.array([each.half for each in blocks]),
+        middle=np.array([block.middle for block in blocks]),
+        half=np.array([block.half for block in blocks]),
     )
 
 
@@ -406,10 +410,10 @@ class _Form:
         turns = 2.0 * np.pi
 
         def by_frequency(signal: Array) -> Array:
-            found = omega * signal
+            scaled = omega * signal
             if "frequency" in parts:
-                found = found + turns * self.times(parts["frequency"], signal)
-            return found
+                scaled = scaled + turns * self.times(parts["frequency"], signal)
+            return scaled
 
         damped = ratio * rate
         if "damping" in parts:

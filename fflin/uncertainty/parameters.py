@@ -62,9 +62,9 @@ class Parameters(dict[str, Parameter]):
         self.pieces = robot.pieces
         self._link_of = robot.link_of
         self._sums = robot._sums
-        of_pieces = (each for item in self.pieces.items() for each in _of_piece(*item))
-        found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
-        super().__init__((each.name, each) for each in found)
+        of_pieces = (parameter for item in self.pieces.items() for parameter in _of_piece(*item))
+        parameters = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
+        super().__init__((parameter.name, parameter) for parameter in parameters)
 
     def find(self, key: str) -> list[str]:
         """Return the names of the parameters that match a name or pattern.
@@ -77,7 +77,8 @@ class Parameters(dict[str, Parameter]):
             body = max(bodies, key=len)
             key = self._link_of[body] + key[len(body) :]
         names = [name for name in self if key == name or not self._of_several_links(name)]
-        names = names if stands_for_any(key, names) else list(self)
+        if not stands_for_any(key, names):
+            names = list(self)
         return [names[i] for i in matching("parameter", key, names)]
 
     def ranked(self, only: str | None) -> list[str]:
@@ -88,9 +89,9 @@ class Parameters(dict[str, Parameter]):
 
         Mass properties of a body of several links are left out if other parameters match.
         """
-        found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
-        found = found or self.find(str(only))
-        return [*filterfalse(self._of_several_links, found)] or found
+        names = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
+        names = names or self.find(str(only))
+        return [*filterfalse(self._of_several_links, names)] or names
 
     def _of_several_links(self, name: str) -> bool:
         return self[name].of in self._sums and self[name].part in OF_PIECES
@@ -111,37 +112,42 @@ class Parameters(dict[str, Parameter]):
         nominal = self._robot
         bodies = self._bodies(values)
         parts = self._by_owner(values)
-        robot = nominal.with_bodies(bodies) if bodies else nominal
+        robot = nominal
+        if bodies:
+            robot = nominal.with_bodies(bodies)
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
-            own, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
-            if own and joint.mode and stiffness:
+            changes, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
+            if changes and joint.mode and stiffness:
                 omega, ratio = joint.oscillation(stiffness, nominal.damping.get(joint.name, 0.0))
-                omega = _TURN * own["frequency"] if "frequency" in own else omega
-                damping = 2.0 * own.get("damping", ratio) * joint.inertia * omega
-                own = {"stiffness": joint.inertia * omega**2, "damping": damping}
-            for part in springs.keys() & own.keys():
-                springs[part][joint.name] = own[part]
+                if "frequency" in changes:
+                    omega = _TURN * changes["frequency"]
+                damping = 2.0 * changes.get("damping", ratio) * joint.inertia * omega
+                changes = {"stiffness": joint.inertia * omega**2, "damping": damping}
+            for part in springs.keys() & changes.keys():
+                springs[part][joint.name] = changes[part]
         inputs = list(robot.inputs)
         for index, (item, names) in enumerate(robot.named_inputs):
-            own = parts.get(names[0], {})
-            if isinstance(item, ReactionWheel) and "inertia" in own:
-                inputs[index] = replace(item, inertia=own["inertia"])
-            if isinstance(item, Thruster) and own:
+            changes = parts.get(names[0], {})
+            if isinstance(item, ReactionWheel) and "inertia" in changes:
+                inputs[index] = replace(item, inertia=changes["inertia"])
+            if isinstance(item, Thruster) and changes:
                 old = zip(AXES, item.position, strict=True)
-                position = [own.get(f"position.{axis}", x) for axis, x in old]
-                torque = own.get("torque", item.torque)
+                position = [changes.get(f"position.{axis}", x) for axis, x in old]
+                torque = changes.get("torque", item.torque)
                 inputs[index] = replace(item, position=position, torque=torque)
         fields = {**springs, "inputs": tuple(inputs)}
         changed = {key: value for key, value in fields.items() if value != getattr(robot, key)}
-        return robot.replace(**changed) if changed else robot
+        if not changed:
+            return robot
+        return robot.replace(**changed)
 
     def _by_owner(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Convert {parameter: value} to {owner: {part: value}}."""
-        found: dict[str, dict[str, float]] = {}
+        owners: dict[str, dict[str, float]] = {}
         for name, value in values.items():
-            found.setdefault(self[name].of, {})[self[name].part] = value
-        return found
+            owners.setdefault(self[name].of, {})[self[name].part] = value
+        return owners
 
     def _bodies(self, values: Mapping[str, float]) -> dict[int, pin.Inertia]:
         """Return {joint: inertia of its body} for all bodies with a changed link.
@@ -150,11 +156,11 @@ class Parameters(dict[str, Parameter]):
         changed link is not physically realisable, raise `InputError`.
         """
         model, bare = self._robot.model, self._robot._bare.model
-        found: dict[int, Array] = {}
+        bodies: dict[int, Array] = {}
         for name, parts in self._by_owner(values).items():
-            own = {*parts} & OF_PIECES
+            changed_parts = {*parts} & OF_PIECES
             piece = self.pieces.get(name)
-            if piece is None or not own:
+            if piece is None or not changed_parts:
                 continue
             com, inertia = piece.frame.actInv(piece.placement.translation), piece.inertia.copy()
             com = [parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)]
@@ -177,10 +183,10 @@ class Parameters(dict[str, Parameter]):
             at = ROOT
             if piece.joint > ROOT:
                 at = bare.getJointId(model.names[piece.joint])
-            found.setdefault(at, bare.inertias[at].toDynamicParameters())
-            found[at] += density * as_inertia(changed).toDynamicParameters()
-            found[at] -= as_inertia(piece).toDynamicParameters()
-        return {at: pin.Inertia.FromDynamicParameters(body) for at, body in found.items()}
+            bodies.setdefault(at, bare.inertias[at].toDynamicParameters())
+            bodies[at] += density * as_inertia(changed).toDynamicParameters()
+            bodies[at] -= as_inertia(piece).toDynamicParameters()
+        return {at: pin.Inertia.FromDynamicParameters(body) for at, body in bodies.items()}
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
@@ -197,8 +203,8 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
     m, c, turn = piece.mass, piece.placement.translation, piece.placement.rotation
     C = skew(c)
     yield change("mass", "kg", m, moments(1.0, c, C.T @ C))
-    own = piece.frame.actInv(c).tolist()
-    for axis, at, d in zip(AXES, own, piece.frame.rotation.T, strict=True):
+    com = piece.frame.actInv(c).tolist()
+    for axis, at, d in zip(AXES, com, piece.frame.rotation.T, strict=True):
         D = skew(d)
         yield change(f"com.{axis}", "m", at, moments(0.0, m * d, m * (D.T @ C + C.T @ D)))
     for entry, (row, column) in ENTRIES.items():
@@ -218,12 +224,12 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
     """
     for index, joint in enumerate(robot.joints):
         name, inertia = joint.name, joint.inertia
-        stiffness, damping, _ = (each[index].item() for each in robot.springs)
+        stiffness, damping, _ = (values[index].item() for values in robot.springs)
         if joint.mode and stiffness:
             omega, ratio = joint.oscillation(stiffness, damping)
             by_rate, per_turn = 2.0 * inertia * omega, 2.0 * inertia * _TURN
-            own = Parameter(name, "frequency", "Hz", omega / _TURN, joint=index)
-            yield replace(own, by_stiffness=by_rate * _TURN, by_damping=per_turn * ratio)
+            frequency = Parameter(name, "frequency", "Hz", omega / _TURN, joint=index)
+            yield replace(frequency, by_stiffness=by_rate * _TURN, by_damping=per_turn * ratio)
             yield Parameter(name, "damping", "1", ratio, joint=index, by_damping=by_rate)
             continue
         per = f"/({joint.unit})" if " " in joint.unit else f"/{joint.unit}"
@@ -260,10 +266,10 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 yield replace(made, wrench=(joint, first, in_joint))
         if isinstance(item, ReactionWheel) and item.inertia:
             joint, axis = carrier(robot.model, item)
-            own = robot.model.getJointId(names[0])
-            spin = robot.model.jointPlacements[own].rotation.T @ axis
+            wheel_joint = robot.model.getJointId(names[0])
+            spin = robot.model.jointPlacements[wheel_joint].rotation.T @ axis
             bodies = {
-                own: moments(0.0, np.zeros(3), np.outer(spin, spin)),
+                wheel_joint: moments(0.0, np.zeros(3), np.outer(spin, spin)),
                 joint: moments(0.0, np.zeros(3), -np.outer(axis, axis)),
             }
             yield Parameter(names[0], "inertia", "kg m^2", float(item.inertia), bodies)

@@ -117,17 +117,17 @@ class Sensitivity:
         """Return the derivatives with respect to one parameter."""
         one = self._one(name)
         matrices = self._derivatives.over([one])
-        first = [each[0] for each in matrices]
+        first = [matrix[0] for matrix in matrices]
         return Derivatives(one.name, one.unit, one.value, *first)
 
     def _one(self, name: str) -> Parameter:
-        found = self.parameters.find(name)
-        if len(found) > 1:
+        names = self.parameters.find(name)
+        if len(names) > 1:
             raise InputError(
-                f"'{name}' matches {len(found)} parameters, expected one; to change several "
+                f"'{name}' matches {len(names)} parameters, expected one; to change several "
                 "parameters together, use along({...})"
             )
-        return self.parameters[found[0]]
+        return self.parameters[names[0]]
 
     def along(self, direction: Mapping[str, float]) -> Derivatives:
         """Return the derivatives for a simultaneous change of several parameters.
@@ -244,13 +244,19 @@ class Sensitivity:
         rows = []
         for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
             small = one.part.partition(".")[0] in ("com", "position")
-            step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
-            effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
+            step = 0.1 * abs(one.value)
+            if not one.value and one.part.startswith("direction"):
+                step = 0.1
+            if small:
+                step = 0.01
+            effect = [
+                step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)
+            ]
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
                 percents = (f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect)
-                said = one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents
-                rows.append((max(effect), *said))
+                cells = one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents
+                rows.append((max(effect), *cells))
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
         if not most:
@@ -262,10 +268,10 @@ class Sensitivity:
             f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
         )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
-        more = f"... and {len(rows) - top} more, see --top"
-        return "\n".join(
-            [folded([title]), "", grid([heads, *most], "ll"), *[more] * (len(rows) > top)]
-        )
+        lines = [folded([title]), "", grid([heads, *most], "ll")]
+        if len(rows) > top:
+            lines.append(f"... and {len(rows) - top} more, see --top")
+        return "\n".join(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.
@@ -281,14 +287,14 @@ class Sensitivity:
         write_record(as_path(path), sensitivity_record(self), checksummed=self.lin.verified)
 
 
-def sensitivity_record(found: Sensitivity) -> Record:
+def sensitivity_record(result: Sensitivity) -> Record:
     """Return the entries that a file stores for a `Sensitivity`."""
-    every = found.parameters.values()
-    return record_of(found.lin) | {
-        "parameters": list(found.names),
+    every = result.parameters.values()
+    return record_of(result.lin) | {
+        "parameters": list(result.names),
         "units": [one.unit for one in every],
         "values": np.array([one.value for one in every]),
-        **dict(zip(("dA", "dB", "dC", "dD", "df0", "dy0"), found._all, strict=True)),
+        **dict(zip(("dA", "dB", "dC", "dD", "df0", "dy0"), result._all, strict=True)),
     }
 
 

@@ -65,7 +65,7 @@ class Uncertain:
     @property
     def ranges(self) -> tuple[Range, ...]:
         """Ranges of the parameters in the order of the blocks; `half` is half the width."""
-        return tuple(each for block in self.blocks for each in block.ranges)
+        return tuple(interval for block in self.blocks for interval in block.ranges)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,7 +95,7 @@ class Uncertain:
                 "remove it with robot.replace(outputs=)"
             )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
-        varied = [each.parameter for each in self.ranges if each.parameter.by_stiffness]
+        varied = [interval.parameter for interval in self.ranges if interval.parameter.by_stiffness]
         pulled = [rest[one.joint] for one in varied]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
@@ -120,14 +120,14 @@ class Uncertain:
             If the inertia of a body with these parameters is not physically realisable.
         """
         known = self._parameters
-        found = dict[str, float]()
-        blocks = {each.name: each for each in self.blocks if each.name not in known}
+        parameter_values = dict[str, float]()
+        blocks = {block.name: block for block in self.blocks if block.name not in known}
         for key, value in numbers("values", values, "parameter", "value").items():
             if key in blocks:
-                found |= blocks[key].values(value)
+                parameter_values |= blocks[key].values(value)
             else:
-                found |= dict.fromkeys(known.find(key), value)
-        return known.robot(found)
+                parameter_values |= dict.fromkeys(known.find(key), value)
+        return known.robot(parameter_values)
 
     def refusal(self, delta: Array) -> str:
         """Return why the robot with deltas (k,) is not physically realisable, or ""."""
@@ -143,23 +143,23 @@ class Uncertain:
         """
         wanted = count("n", n)
         draw = np.random.default_rng(whole("seed", seed, 0))
-        found = list[Array]()
+        deltas = list[Array]()
         lost = 0
-        while len(found) < wanted:
+        while len(deltas) < wanted:
             delta = draw.uniform(-1.0, 1.0, len(self.blocks))
             if not (why := self.refusal(delta)):
-                found.append(delta)
-            elif (lost := lost + 1) >= _TRIES * (len(found) + 1):
+                deltas.append(delta)
+            elif (lost := lost + 1) >= _TRIES * (len(deltas) + 1):
                 raise InputError(
-                    f"only {len(found)} of {lost + len(found)} robots drawn from these ranges "
+                    f"only {len(deltas)} of {lost + len(deltas)} robots drawn from these ranges "
                     f"are valid: {why}; give narrower ranges"
                 )
-        return np.array(found), lost
+        return np.array(deltas), lost
 
     def values(self, delta: Array) -> dict[str, float]:
         """Return the parameter values {name: value} at deltas (k,), for use as argument of `at`."""
         pairs = zip(self.blocks, delta, strict=True)
-        return {each.name: float(each.middle + each.half * d) for each, d in pairs}
+        return {block.name: float(block.middle + block.half * d) for block, d in pairs}
 
     def samples(self, n: int, *, seed: int = 0) -> list[Robot]:
         """Return robots with parameters drawn uniformly from their ranges.
@@ -278,30 +278,32 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     given: dict[str, object] = {}
     for key, value in by_name("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
-            given |= {f"{key}.{part}": each for part, each in value.items()}
+            given |= {f"{key}.{part}": entry for part, entry in value.items()}
         else:
             given[key] = value
     if not given:
         raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
     parameters, alone, together = Parameters(robot), dict[str, Block](), list[Block]()
     for key, value in given.items():
-        own, tied = untied(key, value)
-        found = [_range(parameters[name], own) for name in parameters.find(key)]
+        bounds, tied = untied(key, value)
+        intervals = [_range(parameters[name], bounds) for name in parameters.find(key)]
         if tied:
-            together.append(_tied(key, found, own))
+            together.append(_tied(key, intervals, bounds))
             continue
-        for each in found:
-            one, middle, half = each
-            alone[one.name] = Block(one.name, one.unit, middle, half, (each,))
+        for interval in intervals:
+            one, middle, half = interval
+            alone[one.name] = Block(one.name, one.unit, middle, half, (interval,))
     made = Uncertain(robot, (*alone.values(), *together), parameters)
-    names = [each.parameter.name for each in made.ranges]
+    names = [interval.parameter.name for interval in made.ranges]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(
             f"'{twice[0]}' is tied to other parameters and also has a range of its own; give "
             "only one of these ranges"
         )
     pieces = parameters.pieces
-    for name, other in permutations({each.parameter.of for each in made.ranges} & pieces.keys(), 2):
+    for name, other in permutations(
+        {interval.parameter.of for interval in made.ranges} & pieces.keys(), 2
+    ):
         if pieces[name].whole and pieces[name].joint == pieces[other].joint:
             raise InputError(
                 f"'{other}' is a link of the body '{name}'; give ranges for only one of the two"
@@ -345,7 +347,7 @@ def _range(one: Parameter, value: object) -> Range:
 
 def _tied(key: str, ranges: list[Range], value: object) -> Block:
     """Return the block of several tied parameters, which vary with one common delta."""
-    units = {each.parameter.unit for each in ranges}
+    units = {interval.parameter.unit for interval in ranges}
     if isinstance(value, tuple | list):
         if len(units) > 1:
             raise InputError(
@@ -357,5 +359,5 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
     relative = abs(number(key, value))
     # The half width of a range has the sign of the parameter's nominal value. So a positive delta
     # increases the magnitudes of all tied parameters.
-    scaled = (each._replace(half=relative * each.parameter.value) for each in ranges)
+    scaled = (interval._replace(half=relative * interval.parameter.value) for interval in ranges)
     return Block(key, "1", 1.0, relative, tuple(scaled))

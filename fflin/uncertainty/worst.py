@@ -104,13 +104,13 @@ class Worst:
             f"{self.excluded} samples and corners were excluded, because they are not physically "
             "realisable"
         ]
-        for what, found in (
+        for criterion, case in (
             ("least damping ratio", self.damping),
             ("least disk margin", self.margin),
             ("largest gain from a disturbance at the inputs", self.gain),
         ):
-            at = ", ".join(f"{name} {value:.4g}" for name, value in found.parameters.items())
-            lines.append(f"{what} {found.value:.4g} at {at}")
+            at = ", ".join(f"{name} {value:.4g}" for name, value in case.parameters.items())
+            lines.append(f"{criterion} {case.value:.4g} at {at}")
         where = f"the central {100.0 * self.safe:.3g} % of each range"
         if self.safe >= 1.0:
             where = f"all ranges, and in ranges that are {self.safe:.3g} times as wide"
@@ -118,7 +118,7 @@ class Worst:
 
 
 @in_one_thread
-def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> Worst:
+def searched(model: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     kept = judged_states(lft, K, getattr(gain, "regulated", ()))
@@ -130,12 +130,12 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
         raise InputError(
             "the closed loop at the middle of the ranges is unstable; give a stabilising gain"
         )
-    draws, excluded = of.draws(samples, seed=seed)
+    draws, excluded = model.draws(samples, seed=seed)
     if 2**size <= _CORNERS:
         corners = np.array(list(product((-1.0, 1.0), repeat=size)))
     else:
         corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
-    physical = np.array([not of.refusal(corner) for corner in corners])
+    physical = np.array([not model.refusal(corner) for corner in corners])
     # The random draws come last. So a search with more draws begins like one with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
@@ -143,17 +143,17 @@ def searched(of: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> 
     scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
-    found = []
+    cases = []
     bar = Progress()
     undamped = Figures(loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b)
     for figures in (undamped, loops.figures(disk), loops.figures(whole)):
-        value, delta = _largest(figures, tried, of.refusal)
-        found.append(Found(value, of.values(delta)))
-        bar(len(found), 4)
+        value, delta = _largest(figures, tried, model.refusal)
+        cases.append(Found(value, model.values(delta)))
+        bar(len(cases), 4)
     unstable = loops.undamped(tried) >= 0.0
     safe = min(_safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf)))
     bar.close()
-    damping, margin, gained = found
+    damping, margin, gained = cases
     return Worst(
         damping=replace(damping, value=-damping.value),
         margin=replace(margin, value=min(1.0 / margin.value, 2.0)),
@@ -226,32 +226,32 @@ class Loops:
     def undamped(self, rows: Array) -> Array:
         """Return minus the least damping ratio of each loop (N,); >= 0 means an unstable loop."""
         poles = np.linalg.eigvals(self.matrices(rows)[0])
-        found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
-        return found
+        ratios: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
+        return ratios
 
-    def gains(self, of: Gain, rows: Array, frequencies: Array) -> Array:
+    def gains(self, channel: Gain, rows: Array, frequencies: Array) -> Array:
         """Return the largest gain (N,) over the given frequencies; infinite for unstable loops."""
         F, B = self.matrices(rows)
-        found = np.zeros(len(F))
+        largest = np.zeros(len(F))
         for w in frequencies:
             inner = 1j * w * np.eye(F.shape[-1]) - F
-            response = of.C @ np.linalg.solve(inner, B * of.scale) + of.D
+            response = channel.C @ np.linalg.solve(inner, B * channel.scale) + channel.D
             gram = response.conj().mT @ response
-            found = np.maximum(found, np.linalg.eigvalsh(gram)[..., -1])
-        return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
+            largest = np.maximum(largest, np.linalg.eigvalsh(gram)[..., -1])
+        return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(largest))
 
-    def figures(self, of: Gain) -> Figures:
-        """Return the functions for the criterion "largest gain" of the channel `of`."""
+    def figures(self, channel: Gain) -> Figures:
+        """Return the functions for the criterion "largest gain" of a channel."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
-        at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
+        at = np.argsort([-self.gains(channel, middle, np.array((w,)))[0] for w in sizes])
         peaks = [0.0, *sizes[at[:_FREQUENCIES]]]
 
         def exact(row: Array) -> Array:
-            F, B = (each[0] for each in self.matrices(row))
+            F, B = (matrix[0] for matrix in self.matrices(row))
             if np.linalg.eigvals(F).real.max() >= 0.0:
                 return np.array((np.inf,))
-            value, w = largest_gain(F, B * of.scale, of.C, of.D)
+            value, w = largest_gain(F, B * channel.scale, channel.C, channel.D)
             peaks.append(min(w, 1e300))  # similar loops have their peak near this frequency
             return np.array((value,))
 
@@ -259,11 +259,11 @@ class Loops:
             F, B = self.matrices(rows)
             unstable: Mask = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)
-            _, crossed = gain_crossings(F, B * of.scale, of.C, of.D, limit)
+            _, crossed = gain_crossings(F, B * channel.scale, channel.C, channel.D, limit)
             return unstable | crossed.any(axis=-1)
 
         def quick(rows: Array) -> Array:
-            return self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:]))
+            return self.gains(channel, rows, np.unique(peaks[-_FREQUENCIES:]))
 
         return Figures(quick, exact, above)
 
@@ -325,7 +325,9 @@ def _safe(loops: Loops) -> float:
 
     rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
     largest = largest_bound(response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int))
-    return 1.0 / largest if largest else np.inf
+    if not largest:
+        return np.inf
+    return 1.0 / largest
 
 
 # Upper bounds of the structured singular value mu for real repeated parameters. With real
@@ -343,7 +345,7 @@ def perron(Z: Array) -> Array:
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
         right, left = sizes @ right, sizes.mT @ left
-        right, left = (each / each.max(axis=-2, keepdims=True) for each in (right, left))
+        right, left = (vector / vector.max(axis=-2, keepdims=True) for vector in (right, left))
     d: Array = np.sqrt(left / right)
     return d
 
@@ -370,7 +372,7 @@ def largest_bound(
     """
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
     grid = np.unique(np.concatenate(((0.0,), grid, rates)))
-    at_end = min(bound_of(end[None], each) for each in _scalings(end, blocks))
+    at_end = min(bound_of(end[None], scaling) for scaling in _scalings(end, blocks))
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
     def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
@@ -381,28 +383,29 @@ def largest_bound(
         """
         Z = response(np.linspace(a, b, _INSIDE))
         middle = Z[_INSIDE // 2]
-        found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
-        values = [bound_of(Z, each) for each in found]
-        least = min(bound_of(middle[None], each) for each in found)
-        return min(values), found[int(np.argmin(values))], least
+        real_blocks = blocks if asked else blocks[:0]
+        scalings = [*known, *_scalings(middle, real_blocks)]
+        values = [bound_of(Z, scaling) for scaling in scalings]
+        least = min(bound_of(middle[None], scaling) for scaling in scalings)
+        return min(values), scalings[int(np.argmin(values))], least
 
     for a, b in pairwise(grid.tolist()):
-        value, by, _ = best_of(a, b, False)
-        heap.append((-value, a, b, False, by))
+        value, scaling, _ = best_of(a, b, False)
+        heap.append((-value, a, b, False, scaling))
     heapify(heap)
     reached = at_end
     for _ in range(_DIVISIONS):
         if -heap[0][0] <= _NEAR * reached:
             break
-        value, a, b, asked, by = heappop(heap)
+        value, a, b, asked, scaling = heappop(heap)
         if asked:
             half = 0.5 * (a + b)
             for low, high in ((a, half), (half, b)):
-                heappush(heap, (-best_of(low, high, False, by)[0], low, high, False, by))
+                heappush(heap, (-best_of(low, high, False, scaling)[0], low, high, False, scaling))
         else:
-            value, by, least = best_of(a, b, True, by)
+            value, scaling, least = best_of(a, b, True, scaling)
             reached = max(reached, least)
-            heappush(heap, (-value, a, b, True, by))
+            heappush(heap, (-value, a, b, True, scaling))
     return max(at_end, -heap[0][0])
 
 
@@ -413,21 +416,21 @@ def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
     is from slycot's AB13MD. For a Z with one complex entry, a formula replaces AB13MD.
     """
     none: Array = np.zeros(len(Z))
-    found: list[Scaling] = [(perron(Z)[:, 0], none)]
+    scalings: list[Scaling] = [(perron(Z)[:, 0], none)]
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
-        return [*found, (none + 1.0, np.abs(Z[0]) ** 2 / (2.0 * Z[0].imag))]
+        return [*scalings, (none + 1.0, np.abs(Z[0]) ** 2 / (2.0 * Z[0].imag))]
     try:
         from slycot import ab13md
         from slycot.exceptions import SlycotArithmeticError
     except ImportError:
-        return found
+        return scalings
     if 0 < len(blocks) and len(Z) <= _SIGNALS:
         try:
             # AB13MD does not support repeated real blocks. A delta that occurs once is a real
             # block; a delta that occurs several times is entered as a full complex block.
             _, d, g, *_ = ab13md(Z, blocks, np.where(blocks == 1, 1, 2))
         except SlycotArithmeticError:
-            return found
+            return scalings
         if d.min() > 0.0 and np.isfinite((d, g)).all():
-            found.append((d, g))
-    return found
+            scalings.append((d, g))
+    return scalings

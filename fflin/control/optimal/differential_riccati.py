@@ -93,10 +93,10 @@ def _constant(coefficients: Array, h: Array) -> Array:
     theta = expm(H / 2**doublings)
     inverse = np.linalg.inv(theta[:, n:, n:])
     G, W = -theta[:, :n, n:] @ inverse, -inverse @ theta[:, n:, :n]
-    found = np.array((inverse.mT, _symmetric(G), _symmetric(W)))
+    maps = np.array((inverse.mT, _symmetric(G), _symmetric(W)))
     for _ in range(doublings):
-        found = joined(found, found)
-    T, G, W = found
+        maps = joined(maps, maps)
+    T, G, W = maps
     return np.array((T / of_states, G * of_costs, W / of_costs))
 
 
@@ -113,9 +113,9 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
     h = np.concatenate((b, middle, b)) - start
-    found = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
-    early, late, ends = np.split(found, (3 * count, 6 * count), axis=1)
-    maps = transitions(early, late, h).reshape(3, 3, count, *found.shape[2:]).swapaxes(0, 2)
+    coefficients = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
+    early, late, ends = np.split(coefficients, (3 * count, 6 * count), axis=1)
+    maps = transitions(early, late, h).reshape(3, 3, count, *coefficients.shape[2:]).swapaxes(0, 2)
     times, ends = knots.tolist(), ends.swapaxes(0, 1)
     return [(times[k], times[k + 1], maps[k], ends[k : k + 2]) for k in range(count)]
 

@@ -94,18 +94,20 @@ def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point)
     times = _fine_times(shooting)
     joints = _straight(shooting, start, end, times)
     for t, row in zip(times.tolist(), joints, strict=True):
-        what = f"guess({t:.4g})"
+        label = f"guess({t:.4g})"
         value = guess(t)
         if isinstance(value, Mapping):
-            positions = numbers(what, value, "joint", f"{what} of joint")
+            positions = numbers(label, value, "joint", f"{label} of joint")
             by_name = by_joint(positions, robot.joint_names, robot.joint)
             for name, position in by_name.items():
                 row[robot.joint_names.index(name)] = position
         else:
             row[:] = vector(
-                what, value, robot.n, "joint positions in the order of robot.joint_names"
+                label, value, robot.n, "joint positions in the order of robot.joint_names"
             )
-    base = FloatingBase(shooting.state, start) if conserves_momentum(robot) else None
+    base = None
+    if conserves_momentum(robot):
+        base = FloatingBase(shooting.state, start)
     return _along(shooting, base, times, joints, start, end)
 
 

@@ -178,7 +178,10 @@ class Loops:
             # The path is on the ellipse. Select the point of the ellipse that is farthest away from
             # the posture, or try several points if the posture is the path itself.
             toward = np.arctan2(posture @ b, posture @ a)
-            for phase in [toward] if posture.any() else np.arange(8) * np.pi / 4.0:
+            phases = np.arange(8) * np.pi / 4.0
+            if posture.any():
+                phases = np.array([toward])
+            for phase in phases:
                 first = np.cos(phase) * a + np.sin(phase) * b
                 second = np.cos(phase) * b - np.sin(phase) * a
                 # The loop first (1 - cos) + second sin is oriented from `second` to `first`.
@@ -222,7 +225,8 @@ class Loops:
             return np.concatenate((self.error(joints), self.beyond(joints).max(axis=0).ravel()))
 
         ellipses = sorted(
-            self.ellipses(circles, postures), key=lambda each: float(np.linalg.norm(error(each)))
+            self.ellipses(circles, postures),
+            key=lambda candidate: float(np.linalg.norm(error(candidate))),
         )[:_IMPROVED]
         angle = float(np.linalg.norm(self.error(self.path)))
         size = float(np.linalg.norm(self.torques(basis, ellipses[0])))
@@ -234,7 +238,7 @@ class Loops:
             return np.concatenate((error(coefficients), torques.ravel()))
 
         for ellipse in ellipses:
-            found = least_squares(
+            solution = least_squares(
                 residuals, ellipse.ravel(), max_nfev=_EVALUATIONS, ftol=1e-4, xtol=1e-4
             )
-            yield found.x.reshape(4, -1)
+            yield solution.x.reshape(4, -1)

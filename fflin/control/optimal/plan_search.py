@@ -302,12 +302,12 @@ class Search(NamedTuple):
             step = again
         return best, most, exceeding
 
-    def _report(self, what: str, trial: Trial, limited: Mask) -> None:
+    def _report(self, phase: str, trial: Trial, limited: Mask) -> None:
         """Report the cost relative to the cost of the guess, and the largest violation."""
         cost = float((self.cost * trial.u**2).sum())
         inside = excess(trial.inside)[limited]
         most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
-        self.report(f"{what}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
+        self.report(f"{phase}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
 
     def _trial(self, q: Array, v: Array, u: Array) -> Trial:
         shooting = self.shooting
@@ -374,10 +374,10 @@ class Search(NamedTuple):
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
-        found = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
-        if found is None:
+        solution = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
+        if solution is None:
             return None
-        z, du, gaps, multipliers = found
+        z, du, gaps, multipliers = solution
         moved = rows @ np.hstack((z, du)).ravel()
         outside = float(excess(room - moved).sum())
         forces = (rows.T @ multipliers).reshape(len(u), -1)
@@ -394,7 +394,9 @@ class Search(NamedTuple):
         appends a value.
         """
         left.append(float(excess(trial.knots - step.z).sum()))
-        before = left[-1 - _STAGNANT] if len(left) > _STAGNANT else np.inf
+        before = np.inf
+        if len(left) > _STAGNANT:
+            before = left[-1 - _STAGNANT]
         return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
     def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
@@ -431,7 +433,9 @@ class Search(NamedTuple):
                 break
             u = np.clip(trial.u + step.du, *self.limits)
             trial = self._trial(*shooting.moved(trial.q, trial.v, step.z), u)
-        return trial if trial.gap <= _MEETS else self._flown(trial.u)
+        if trial.gap <= _MEETS:
+            return trial
+        return self._flown(trial.u)
 
     def _flown(self, u: Array) -> Trial:
         """Integrate the motion from the start under the inputs u, and return it as a trial."""
@@ -523,6 +527,7 @@ def solve_stages(
     open_ = np.full(m, np.inf)
     G = sp.vstack((sp.hstack((soft, slack)), sp.hstack((soft, -slack))), format="csc")
     of_G = np.append(room[0], -open_), np.append(open_, room[1])
+    soft_rows = (G, *of_G) if m else (None, None, None)
     solver = piqp.SparseSolver()
     for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
         setattr(solver.settings, name, _ACCURACY)
@@ -531,14 +536,16 @@ def solve_stages(
         np.append(g.ravel() * size, prices) / unit,
         sp.hstack((E, sp.csc_array((E.shape[0], m))), format="csc"),
         of_rows * np.append(np.zeros(nx), -c),
-        *((G, *of_G) if m else (None, None, None)),
+        *soft_rows,
         np.append(low, np.zeros(m)),
         np.append(high, open_),
     )
     if solver.solve() != piqp.PIQP_SOLVED:
         return None
-    found = solver.result
-    w = (found.x[: len(size)] * size).reshape(knots, nw)
-    y = (unit * of_rows * found.y).reshape(knots, nx)[1:]
-    multipliers = unit * (found.z_u[m:] - found.z_l[:m]) if m else np.zeros(0)
+    result = solver.result
+    w = (result.x[: len(size)] * size).reshape(knots, nw)
+    y = (unit * of_rows * result.y).reshape(knots, nx)[1:]
+    multipliers = np.zeros(0)
+    if m:
+        multipliers = unit * (result.z_u[m:] - result.z_l[:m])
     return w[:, :nx], np.clip(w[:, nx:], *limits), y, multipliers

@@ -68,13 +68,17 @@ def solved(
 ) -> Solution:
     """Return a `Solution` with sorted poles and with the margin of the poles."""
     poles = poles[np.lexsort((poles.imag, poles.real))]
-    margin = float(1.0 - np.abs(poles).max() if discrete else -poles.real.max())
+    margin = float(-poles.real.max())
+    if discrete:
+        margin = float(1.0 - np.abs(poles).max())
     return Solution(P, K, poles, residual, method, margin, rounding)
 
 
 def rates_of(poles: Values, dt: float) -> Values:
     """Convert poles to continuous-time rates [1/s]; dt [s] is 0 if the poles are continuous."""
-    return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt if dt else poles
+    if not dt:
+        return poles
+    return np.log(np.where(poles == 0.0, 1e-300, poles) + 0j) / dt
 
 
 class _Trial(NamedTuple):
@@ -98,12 +102,15 @@ class Riccati:
     """
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
-        N = None if N is None or not N.any() else N
+        if N is not None and not N.any():
+            N = None
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
         # For a sampled system, the equation is written in A - I, because A' P A - P would lose
         # accuracy by cancellation.
-        self.rate = A - np.eye(len(A)) if dt else A
+        self.rate = A
+        if dt:
+            self.rate = A - np.eye(len(A))
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
         self._inputs = B.T
@@ -156,14 +163,18 @@ class Riccati:
         """
         if not self.discrete:
             Y = self._inputs @ P
-            return self.R_factor, Y if self.cross is None else Y + self.cross
+            if self.cross is not None:
+                Y = Y + self.cross
+            return self.R_factor, Y
         PB = P @ self.B
         W = self.R + self.B.T @ PB
         factor, indefinite = dpotrf(0.5 * (W + W.T), lower=1)
         if indefinite:
             raise np.linalg.LinAlgError("R + B' P B is not positive definite")
         right = PB.T @ self.A
-        return factor, dtrtrs(factor, right if self.N is None else right + self.N.T, lower=1)[0]
+        if self.N is not None:
+            right = right + self.N.T
+        return factor, dtrtrs(factor, right, lower=1)[0]
 
 
 def solve(
@@ -181,16 +192,19 @@ def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
     """Return the solution of the half-size method, or None if it is not reliable."""
-    found = structured(Riccati(A, B, Q, R, N, dt))
-    return found if is_reliable(found, dt) else None
+    solution = structured(Riccati(A, B, Q, R, N, dt))
+    if is_reliable(solution, dt):
+        return solution
+    return None
 
 
-def is_reliable(found: Solution | None, dt: float) -> bool:
+def is_reliable(solution: Solution | None, dt: float) -> bool:
     """Return whether a solution is accurate and has no pole near the stability boundary."""
-    if found is None or not found.sound:
+    if solution is None or not solution.sound:
         return False
-    size = np.abs(found.poles - 1.0 if dt else found.poles).max()
-    return bool(found.margin >= _NEAR_BOUNDARY * size)
+    distances = solution.poles - 1.0 if dt else solution.poles
+    size = np.abs(distances).max()
+    return bool(solution.margin >= _NEAR_BOUNDARY * size)
 
 
 def best_solution(equation: Riccati, start: Solution | None) -> Solution:
@@ -199,21 +213,23 @@ def best_solution(equation: Riccati, start: Solution | None) -> Solution:
     SciPy is not used if `start` is accurate. If there is no solution, raise `LinAlgError`. Newton's
     method refines the solutions (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
     """
-    if start is not None and start.sound:
-        return start
-    found = [] if start is None else [start]
+    solutions = list[Solution]()
+    if start is not None:
+        if start.sound:
+            return start
+        solutions.append(start)
     for unit in (False, True):
         # SciPy raises one of these errors if it finds no finite solution, if R is singular, or if
         # it cannot reorder the eigenvalues of the pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
-                found.append(general)
+                solutions.append(general)
                 if general.sound:
                     break
-    if not found:
+    if not solutions:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
-    return min(found, key=lambda solution: solution.residual)
+    return min(solutions, key=lambda solution: solution.residual)
 
 
 def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
@@ -222,7 +238,7 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
     Newton's method starts from the loop of a modified Q: the rows and columns of the velocities are
     multiplied by 1 + `apart`.
     """
-    found = None
+    solution = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
         if source is None:
@@ -240,13 +256,14 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         modes, cost = loop
         P = modes.lyapunov_modal(cost)
-        refined = _refined(equation, P, None if equation.discrete else modes)
-        found = _finished(equation, *refined, "structured")
-    if apart or (found is not None and found.sound):
-        return found
+        known_modes = None if equation.discrete else modes
+        refined = _refined(equation, P, known_modes)
+        solution = _finished(equation, *refined, "structured")
+    if apart or (solution is not None and solution.sound):
+        return solution
     # If modes coincide, as in critical damping, the matrix V of the modes is singular. Newton's
     # method then starts from the loop of a slightly different Q.
-    return structured(equation, _APART) or found
+    return structured(equation, _APART) or solution
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
@@ -266,7 +283,9 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
-    return continuous if continuous.definite else None
+    if not continuous.definite:
+        return None
+    return continuous
 
 
 def _finished(
@@ -275,7 +294,7 @@ def _finished(
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
     poles = modes.poles(F) if modes else np.linalg.eigvals(F)
-    found = solved(
+    solution = solved(
         trial.P,
         K,
         poles,
@@ -284,7 +303,9 @@ def _finished(
         rounding=trial.rounding,
         discrete=equation.discrete,
     )
-    return found if found.margin > 0.0 else None
+    if solution.margin > 0.0:
+        return solution
+    return None
 
 
 def _refined(
@@ -334,7 +355,8 @@ def _general(equation: Riccati, unit: bool) -> Array:
     B, R, N = equation.B, equation.R, equation.N
     if unit:
         B = dtrtrs(equation.R_factor, B.T, lower=1)[0].T
-        N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+        if N is not None:
+            N = dtrtrs(equation.R_factor, N.T, lower=1)[0].T
         R = np.eye(len(R))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
@@ -355,7 +377,10 @@ class ModalMatrix:
         self.inverse = np.linalg.inv(V)
         self.values = poles
         across = poles.conj()[:, None]
-        self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
+        sums = across + poles
+        if discrete:
+            sums = across * poles - 1.0
+        self._factors = -1.0 / sums
 
     @classmethod
     def of(cls, F: Array, discrete: bool) -> ModalMatrix:
@@ -390,6 +415,18 @@ class ModalMatrix:
         return values
 
 
+def _inverse(matrix: Array) -> Array | None:
+    """Return the inverse of a matrix, or None if the matrix is singular or nearly singular."""
+    diagonal = matrix.diagonal()
+    if np.count_nonzero(matrix) == np.count_nonzero(diagonal):
+        if not diagonal.all():
+            return None
+        return np.diag(1.0 / diagonal)
+    if not np.linalg.cond(matrix) <= 1e8:
+        return None
+    return np.linalg.inv(matrix)
+
+
 def second_order_loop(
     A: Array, B: Array, Q: Array, R_factor: Array
 ) -> tuple[ModalMatrix, Values] | None:
@@ -411,11 +448,7 @@ def second_order_loop(
     sizes = np.abs(Ls.diagonal())
     singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
-    diagonal = A12.diagonal()
-    if np.count_nonzero(A12) == np.count_nonzero(diagonal):
-        inverse = np.diag(1.0 / diagonal) if diagonal.all() else None
-    else:
-        inverse = np.linalg.inv(A12) if np.linalg.cond(A12) <= 1e8 else None
+    inverse = _inverse(A12)
     if singular or inverse is None:
         return None
     # x = T (p, dp/dt)

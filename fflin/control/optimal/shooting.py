@@ -100,10 +100,10 @@ class Shooting:
 
     def flown(self, start: Point, u: Array) -> Point:
         """Integrate the motion from a point under the inputs u; return q and v at the knots."""
-        q, v = (np.tile(each, (len(u), 1)) for each in start)
+        q, v = (np.tile(values, (len(u), 1)) for values in start)
         for k in range(len(u) - 1):
-            found = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
-            q[k + 1], v[k + 1] = found[0][0, -1], found[1][0, -1]
+            motions = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
+            q[k + 1], v[k + 1] = motions[0][0, -1], motions[1][0, -1]
         return q, v
 
     def limited_values(self, q: Array, v: Array) -> Array:
@@ -124,7 +124,7 @@ class Shooting:
         The values have the shape (N, parts, nx).
         """
         every = (motions[0].shape[1] - 1) // parts
-        return self.limited_values(*(each[:, every::every] for each in motions))
+        return self.limited_values(*(points[:, every::every] for points in motions))
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
         """Double the number of steps until the interval ends have the given accuracy [rad, m, s].
@@ -156,10 +156,11 @@ class Shooting:
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         motions = self.motions(q, v, u, 4 * steps)
         late = np.arange(2 * steps + 1) / (2.0 * steps)
-        late = np.zeros_like(late) if self.held else late
-        q, v = (each[:, ::2] for each in motions)
+        if self.held:
+            late = np.zeros_like(late)
+        q, v = (motion[:, ::2] for motion in motions)
         inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
-        points = (each.reshape(-1, each.shape[-1]) for each in (q, v, inputs))
+        points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
         models = self._linearizer.along(*points)
         A, B = (models[name].reshape(N, len(late), nx, -1) for name in "AB")
         late = late[:, None, None]
