@@ -26,9 +26,7 @@ def skew(a: Array) -> Array:
 def product(a: Array, b: Array) -> Array:
     """Return the matrix product ``a b`` for shapes (..., i, j) and (..., j, k)."""
     # `dot` takes half the time of `@` for two small matrices.
-    if a.ndim == b.ndim == 2:
-        return a.dot(b)
-    return a @ b
+    return a.dot(b) if a.ndim == b.ndim == 2 else a @ b
 
 
 def row_products(rows: Array, matrix: Array) -> Array:
