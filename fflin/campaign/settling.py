@@ -185,13 +185,12 @@ class Loop:
         options |= {"within_chart": True}
         histories = 1
         transition = None
-        over = self._is_over
         if predicts:
             histories = checks + 1
             transition = self._transition(dt, every)
-            over = None
         options |= {"histories": histories}
         judge = partial(self._judged, transition)
+        over = None if predicts else self._is_over
         policy = StateFeedback(lin, self.K)
         return CampaignJob(self.robot, policy, None, 0, engine, options, judge, over)
 

@@ -261,9 +261,7 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
         for frame in model.frames.tolist()
         if frame.parentJoint == deepest and frame.type == pin.FrameType.BODY
     ]
-    if not links:
-        return None
-    return links[-1]
+    return links[-1] if links else None
 
 
 def check_playback(
