@@ -295,7 +295,6 @@ def sweep(arguments: Namespace) -> Report:
     linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
-
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
     message = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}"
     if part.exists():

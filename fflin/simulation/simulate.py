@@ -462,9 +462,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if lin is None:  # a discrete-time model without its continuous-time model
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    wheel_rows = (
-        plan.plant.state.nx // 2 + plan.limits.wheels.row
-    )  # indices of limited wheel speeds in x
+    # Indices in x of the wheel speeds that have limits.
+    wheel_rows = plan.plant.state.nx // 2 + plan.limits.wheels.row
     applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[wheel_rows])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0

@@ -315,7 +315,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     compared = target if len(target) else motion.q[:1]
     error_of = errors(robot, motion.q[shown], compared, motion.wheels)
     label_form = "{} error" if len(target) else "{} change"
-    # Only the errors from a moving target are all plotted.
+    # The errors of the joints are plotted only for a moving target.
     plotted = 4 if len(target) > 1 else 2
     rest = resting_from(motion) if len(target) > 1 else None
     readouts = [
