@@ -107,7 +107,13 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
     """
     value_of_index: dict[int, T] = {}
     groups = {*map(group_of, names)}
-    for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
+
+    def priority(key: str) -> int:
+        if _is_pattern(key):
+            return 1
+        return 0 if key in groups else 2
+
+    for key in sorted(values, key=priority):
         value_of_index |= dict.fromkeys(matching(kind, key, names), values[key])
     return value_of_index
 

@@ -28,7 +28,8 @@ class Progress:
     def __init__(self, shown: bool | None = None) -> None:
         self._shown = on_terminal() if shown is None else shown
         self._start = time.monotonic()
-        self._next = self._start + (_PATIENCE if shown is None else 0.0)
+        patience = _PATIENCE if shown is None else 0.0
+        self._next = self._start + patience
         self._drawn = False
         self._announced = ""
         self.done, self.total = 0, 0

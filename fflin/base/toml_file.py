@@ -131,7 +131,9 @@ def flat(table: object) -> object:
         pairs = []
         for key, value in table.items():
             inner = value if isinstance(value, dict) and value else {"": value}
-            pairs += [(f"{key}.{below}" if below else key, x) for below, x in inner.items()]
+            for below, entry in inner.items():
+                name = f"{key}.{below}" if below else key
+                pairs.append((name, entry))
         table = dict(pairs)
     return table
 

@@ -128,7 +128,7 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
                 stacks[name] = np.empty((len(batch), *value.shape[1:]))
             stacks[name][rows] = value
     vectors = [kind.vectors(q, v) for q, v in zip(batch.q, batch.v, strict=True)]
-    q, v = (np.array(matrices) for matrices in zip(*vectors, strict=True))
+    q, v = (np.array(values) for values in zip(*vectors, strict=True))
     positions = np.zeros_like(v) if kind.tangent else q
     for stack in stacks.values():
         frozen(stack)

@@ -291,8 +291,8 @@ class Campaign(FrozenArrays):
         """
         if not isinstance(condition, str):
             dimension("condition", condition)  # refuses rows of different lengths
-            listed = isinstance(condition, np.ndarray | list)
-            mask = np.asarray(condition if listed else None)
+            given = condition if isinstance(condition, np.ndarray | list) else None
+            mask = np.asarray(given)
             if mask.shape != (len(self),) or mask.dtype != bool:
                 raise InputError(
                     f"condition has shape {mask.shape} of {mask.dtype}, expected a text such as "

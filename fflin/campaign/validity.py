@@ -347,7 +347,9 @@ def _checked_displacement(
         )
     groups = {name.partition(".")[0] for name in lin.state_names}
     names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
-    largest = {key: given[key] if name in groups else 0.0 for key, name in names.items()}
+    largest = {}
+    for key, name in names.items():
+        largest[key] = given[key] if name in groups else 0.0
     if not any(largest.values()):
         raise InputError(
             "no state of the model is displaced; give a nonzero displacement of one of its states"

@@ -82,7 +82,10 @@ def info(arguments: Namespace) -> Report:
     rows = [["input", "unit", "min", "max"]]
     for name, unit in zip(inputs.names, inputs.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
-        rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
+        row = [name, unit]
+        for end in ends:
+            row.append(f"{end:.5g}" if math.isfinite(end) else ".")
+        rows.append(row)
     table = grid(cut(rows, "see --json"), "ll")
     text = f"{robot_info(robot, str(properties))}\n\n{table}"
     notes = robot.notes

@@ -411,12 +411,16 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         **{"title": title, "real": real, "frame": frame, "dt": law.dt},
         "kind": "samples" if len(tables["u0"]) > 1 else kind,
         "signals": {"input": law.inputs, kind: law.signals},
-        "nq": len(lin.q) if lin else robot.nq,
+        "nq": robot.nq,
         "u0": tables["u0"][0].tolist(),
         "memory": 0 if state else len(tables["A"]),
-        "reference": None if lin is None else lin.placement.tolist(),
-        "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+        "reference": None,
+        "point": None,
     }
+    if lin is not None:
+        about["nq"] = len(lin.q)
+        about["reference"] = lin.placement.tolist()
+        about["point"] = [lin.q.tolist(), lin.v.tolist()]
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}

@@ -74,7 +74,9 @@ def locked_model(
         require_known("joint to lock", [name], movable)
 
     given = joints_by_name("joint to lock", requested(lock), movable, find)
-    values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
+    values: dict[str, float | None] = {}
+    for name, position in given.items():
+        values[name] = None if position is None else number(f"lock '{name}'", position)
     for name, mimic in mimics.items():
         if values.get(name) is None and (name in values or mimic.leader in values):
             values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset

@@ -176,8 +176,8 @@ def passed(t: Array, signals: Iterable[Curve]) -> tuple[Passed, ...]:
         if beyond[at]:
             value = float(curve.values[at])
             first = curve.group == "q_m" and bool(beyond[0])
-            limit = float(high if value > high else low)
-            one = Passed(curve.name, value, float(t[at]), limit, curve.unit, first)
+            limit = high if value > high else low
+            one = Passed(curve.name, value, float(t[at]), float(limit), curve.unit, first)
             worst.append((-excess[at] / (size or 1e-12), one))
     return tuple(one for _, one in sorted(worst))
 
@@ -469,7 +469,12 @@ def motion_record(motion: Motion) -> dict[str, object]:
     # The errors of revolute and of prismatic joints have the same title but different units. For a
     # robot with both kinds of joints, the unit is added to the title.
     count = Counter(error.title for error in errors)
-    keys = [f"{x.title} [{x.unit}]" if count[x.title] > 1 else x.title for x in errors]
+    keys = []
+    for error in errors:
+        key = error.title
+        if count[key] > 1:
+            key += f" [{error.unit}]"
+        keys.append(key)
     return {
         **{name: getattr(motion, name) for name in copied},
         "duration": t[-1],

@@ -233,7 +233,8 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
     The poses are at the samples of the motion whose indices are in `shown` (N,).
     """
     parts = motion._phases
-    first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
+    counts = [len(part.t) if isinstance(part, Motion) else 0 for part in parts]
+    first = np.cumsum([0, *counts])
     for k, caught in enumerate(parts):
         if not isinstance(caught, Capture):
             continue

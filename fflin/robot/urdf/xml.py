@@ -86,7 +86,10 @@ class Element:
                 f"{self.title} has a second <{tag}>; the first <{tag}> is in line "
                 f"{children[0].line}; keep one of them"
             )
-        for child in children if attributes else ():
+        if not children:
+            return None
+        child = children[0]
+        if attributes:
             for name in (x for x in child.attributes if x not in attributes and ":" not in x):
                 if nearest(name.lower(), attributes, _NEAR):
                     raise child.error(
@@ -96,7 +99,7 @@ class Element:
                 child.note(
                     f"attribute {quoted(name)} of <{tag}> is not part of URDF, and is ignored"
                 )
-        return children[0] if children else None
+        return child
 
     def require(self, tag: str, *attributes: str) -> Element:
         """Return the child that `find` returns, or raise `UrdfError` if there is none."""
