@@ -127,10 +127,12 @@ def _untyped(function: object) -> None:
     from inspect import Parameter, signature
 
     shown = signature(function)
-    plain = [each.replace(annotation=Parameter.empty) for each in shown.parameters.values()]
+    plain = [
+        parameter.replace(annotation=Parameter.empty) for parameter in shown.parameters.values()
+    ]
     function.__signature__ = shown.replace(parameters=plain, return_annotation=Parameter.empty)
 
 
 def __dir__() -> list[str]:
-    own = (name for name in globals() if name.startswith("__") and name.endswith("__"))
-    return sorted({*own, *_MODULES})
+    special = (name for name in globals() if name.startswith("__") and name.endswith("__"))
+    return sorted({*special, *_MODULES})

@@ -50,9 +50,10 @@ def listen() -> None:
 def leave(reason: BaseException) -> NoReturn:
     """Print in one line that the command was stopped, and exit without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    why = reason if reason.args else "stopped"
     try:
         # The line is written in one call, so that the output of other processes cannot split it.
-        sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
+        sys.stderr.write(f"fflin: {why}\n")
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:  # the program that reads the output has ended

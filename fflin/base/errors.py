@@ -21,9 +21,11 @@ _INDENTED = re.compile(r"[ \t]*\r?\n[ \t]+")
 def one_line(text: str) -> str:
     """Return a message as one line: escape control characters and cut long text."""
     text = _INDENTED.sub(" ", text)
-    text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
-    text = _LONG_NAME.sub(lambda found: _cut(found[0], 60), text)
-    return text if len(text) <= _LONGEST else _cut(text, _LONGEST)
+    text = _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+    text = _LONG_NAME.sub(lambda match: _cut(match[0], 60), text)
+    if len(text) <= _LONGEST:
+        return text
+    return _cut(text, _LONGEST)
 
 
 def _cut(text: str, size: int) -> str:
@@ -263,7 +265,10 @@ def located(where: str) -> Iterator[None]:
 def listed(names: Iterable[str]) -> str:
     """Join names for a sentence: give the first six distinct names, and count the others."""
     names = list(dict.fromkeys(names))
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    text = ", ".join(names[:6])
+    if len(names) > 6:
+        text += f" and {len(names) - 6} more"
+    return text
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
@@ -278,7 +283,8 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
         hint = "no such names exist"
     else:
         hint = f"known names: {', '.join(names[:12])}"
-        hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
+        if len(names) > 12:
+            hint += f", ... ({len(names)} in all)"
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")
 
 
@@ -287,8 +293,8 @@ def optional_package(name: str, needed: str, extra: str) -> ModuleType:
     try:
         return import_module(name)
     except ImportError:
-        said = f"{needed}; install it with: pip install 'fflin[{extra}]'"
-        raise MissingPackageError(said) from None
+        message = f"{needed}; install it with: pip install 'fflin[{extra}]'"
+        raise MissingPackageError(message) from None
 
 
 def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:

@@ -89,7 +89,9 @@ def _in_place_of(axes: object) -> Figure:
     """
     from matplotlib.axes import Axes as GivenAxes
 
-    spec = axes.get_subplotspec() if isinstance(axes, GivenAxes) else None
+    spec = None
+    if isinstance(axes, GivenAxes):
+        spec = axes.get_subplotspec()
     if not isinstance(axes, GivenAxes) or spec is None:
         kind = type(axes).__name__
         raise InputError(f"axes has type {kind}, expected matplotlib axes, as of pyplot.subplots")
@@ -108,5 +110,5 @@ def require_matplotlib() -> None:
         optional_package("matplotlib", "figures need matplotlib", "plot")
     except ValueError as error:  # invalid MPLBACKEND or settings file
         why = str(error).partition(";")[0]
-        said = f"matplotlib cannot be loaded: {why}; correct MPLBACKEND"
-        raise MissingPackageError(said) from None
+        message = f"matplotlib cannot be loaded: {why}; correct MPLBACKEND"
+        raise MissingPackageError(message) from None

@@ -24,10 +24,16 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
     """Return the fraction of successes, and its exact confidence interval (Clopper-Pearson)."""
     from scipy.special import betaincinv
 
-    tail, failures = (1.0 - confidence) / 2.0, count - successes
-    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
-    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
-    return Estimate(successes / count if count else math.nan, float(low), float(high))
+    tail = (1.0 - confidence) / 2.0
+    failures = count - successes
+    low = 0.0
+    if successes:
+        low = betaincinv(successes, failures + 1, tail)
+    high = 1.0
+    if failures:
+        high = betaincinv(successes + 1, failures, 1.0 - tail)
+    fraction = successes / count if count else math.nan
+    return Estimate(fraction, float(low), float(high))
 
 
 def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
@@ -41,8 +47,12 @@ def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[f
     - the confidence interval (low, high) for the success rate of all runs.
     """
     count = len(failed)
-    inside = int(failed.argmax()) if failed.any() else count
-    bound = (1.0 - confidence) ** (1.0 / inside) if inside else 0.0
+    inside = count
+    if failed.any():
+        inside = int(failed.argmax())
+    bound = 0.0
+    if inside:
+        bound = (1.0 - confidence) ** (1.0 / inside)
     _, low, high = clopper_pearson(count - int(failed.sum()), count, confidence)
     return inside, bound, (low, high)
 
@@ -90,5 +100,5 @@ def rank_correlations(columns: Array, values: Array) -> Array:
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)
     shares = ranks / np.where(size > 0.0, size, 1.0)
-    found: Array = shares[:, :-1].T @ shares[:, -1]
-    return found
+    correlations: Array = shares[:, :-1].T @ shares[:, -1]
+    return correlations

@@ -25,15 +25,18 @@ def group_of(name: str) -> str:
     return name.partition(".")[0] if "." in name else ""
 
 
-def input_keys(of: Any) -> tuple[str, ...]:
+def input_keys(model: Any) -> tuple[str, ...]:
     """Return the names GROUP.ENTRY of inputs.
 
     The object `of` has the attributes `input_names` and `input_units`.
     """
-    return tuple(
-        name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
-        for name, unit in zip(of.input_names, of.input_units, strict=True)
-    )
+    keys = []
+    for name, unit in zip(model.input_names, model.input_units, strict=True):
+        key = name
+        if group_of(name) not in _GROUPS:
+            key = f"{_OF_UNIT.get(unit, 'input')}.{name}"
+        keys.append(key)
+    return tuple(keys)
 
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
@@ -48,16 +51,18 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
     `first` and `last` are indices. Consecutive names without a group form a run if they have the
     same unit.
     """
-    found: list[tuple[int, int, str, list[str]]] = []
+    blocks: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
         first = i
-        of = [unit]
-        if found and found[-1][2] == group and (group or unit in found[-1][3]):
-            first, _, _, of = found.pop()
-            of = list(dict.fromkeys((*of, unit)))
-        found.append((first, i, group, of))
-    return [(first, last, group, "|".join(of)) for first, last, group, of in found]
+        block_units = [unit]
+        if blocks and blocks[-1][2] == group and (group or unit in blocks[-1][3]):
+            first, _, _, block_units = blocks.pop()
+            block_units = list(dict.fromkeys((*block_units, unit)))
+        blocks.append((first, i, group, block_units))
+    return [
+        (first, last, group, "|".join(block_units)) for first, last, group, block_units in blocks
+    ]
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
@@ -71,18 +76,18 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     # first dot. Only * and ? are wildcards, because joint names may contain brackets.
     pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
-    found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
-    if not found:
-        found = [i for i, n in enumerate(names) if pattern.fullmatch(n.partition(".")[2])]
-        groups = list(dict.fromkeys(group_of(names[i]) for i in found))
+    indices = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
+    if not indices:
+        indices = [i for i, n in enumerate(names) if pattern.fullmatch(n.partition(".")[2])]
+        groups = list(dict.fromkeys(group_of(names[i]) for i in indices))
         if len(groups) > 1:
             written = " or ".join(f"{group}.{key}" for group in groups)
             fits = ", ".join(groups)
             raise InputError(f"{kind} '{key}' is ambiguous: it is in {fits}; write {written}")
-    if not found:
+    if not indices:
         known = dict.fromkeys((*filter(None, map(group_of, names)), *names))
         raise unknown(kind, key, known)
-    return found
+    return indices
 
 
 def stands_for_any(key: str, names: Sequence[str]) -> bool:
@@ -100,17 +105,26 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
 
     A name overrides a pattern, and a pattern overrides a group.
     """
-    found: dict[int, T] = {}
+    value_of_index: dict[int, T] = {}
     groups = {*map(group_of, names)}
-    for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
-        found |= dict.fromkeys(matching(kind, key, names), values[key])
-    return found
+
+    def priority(key: str) -> int:
+        if _is_pattern(key):
+            return 1
+        return 0 if key in groups else 2
+
+    for key in sorted(values, key=priority):
+        value_of_index |= dict.fromkeys(matching(kind, key, names), values[key])
+    return value_of_index
 
 
 def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
     """Return {velocity state: rate}; `values` has joints, states, groups or patterns as keys."""
     names = state_keys(joints)[6 + len(joints) :]
-    full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
+    full = {}
+    for key, value in values.items():
+        name = f"qdot_m.{key}" if key in joints else key
+        full[name] = value
     return {names[index]: value for index, value in by_name("velocity", full, names).items()}
 
 
@@ -128,12 +142,12 @@ def joints_by_name(
     """
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
     states = [f"q_m.{name}" for name in joints]
-    found = {joints[i]: value for i, value in by_name(kind, many, states).items()}
+    value_of_joint = {joints[i]: value for i, value in by_name(kind, many, states).items()}
     for key, value in values.items():
         if key not in many:
             find(name := str(key).removeprefix("q_m."))
-            found[name] = value
-    return found
+            value_of_joint[name] = value
+    return value_of_joint
 
 
 def _is_pattern(key: object) -> bool:

@@ -28,7 +28,8 @@ class Progress:
     def __init__(self, shown: bool | None = None) -> None:
         self._shown = on_terminal() if shown is None else shown
         self._start = time.monotonic()
-        self._next = self._start + (_PATIENCE if shown is None else 0.0)
+        patience = _PATIENCE if shown is None else 0.0
+        self._next = self._start + patience
         self._drawn = False
         self._announced = ""
         self.done, self.total = 0, 0
@@ -41,10 +42,15 @@ class Progress:
         """Print the estimated duration of a computation, if it is at least 10 s."""
         if seconds < _WORTH:
             return
-        size, unit = (seconds / 3600.0, "h") if seconds > 7200.0 else (seconds / 60.0, "min")
-        size, unit = (seconds, "s") if seconds < 120.0 else (size, unit)
-        on = f"{cores} core{'s' * (cores != 1)}"
-        print(f"fflin: about {float(f'{size:.2g}'):g} {unit} on {on}", file=sys.stderr)
+        if seconds < 120.0:
+            size, unit = seconds, "s"
+        elif seconds <= 7200.0:
+            size, unit = seconds / 60.0, "min"
+        else:
+            size, unit = seconds / 3600.0, "h"
+        shown = float(f"{size:.2g}")
+        counted_cores = "1 core" if cores == 1 else f"{cores} cores"
+        print(f"fflin: about {shown:g} {unit} on {counted_cores}", file=sys.stderr)
 
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
         """Show the label `what`, and a bar for `done` of `total` steps.
@@ -59,7 +65,8 @@ class Progress:
             share = done / total
             spent = time.monotonic() - self._start
             left = spent * (1.0 - share) / share
-            hint = hint if spent > LONG_RUN else ""
+            if spent <= LONG_RUN:
+                hint = ""
             bar = "#" * round(30 * share)
             self.say(f"{what}[{bar:<30}] {share:4.0%}, {left:.0f} s left {hint}")
 
@@ -81,7 +88,7 @@ class Progress:
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
     """Return `sys.path` without the entries that lead to the given folders."""
-    return [entry for entry in sys.path if not any(same_file(entry, each) for each in folders)]
+    return [entry for entry in sys.path if not any(same_file(entry, folder) for folder in folders)]
 
 
 def memory() -> float:

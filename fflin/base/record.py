@@ -97,20 +97,24 @@ def require_finite(record: Mapping[str, object]) -> None:
     """Raise `InputError` if a value is not finite."""
     for key, value in record.items():
         if isinstance(value, dict):
-            require_finite({f"{name} of {key}": each for name, each in value.items()})
+            require_finite({f"{name} of {key}": entry for name, entry in value.items()})
         elif isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
             raise InputError(f"{key} is not finite; only finite values can be saved")
 
 
 def text(value: object) -> str:
     """Return a string from a record, or raise `InputError`."""
-    return value if isinstance(value, str) else str(_single(value, "a text"))
+    if isinstance(value, str):
+        return value
+    return str(_single(value, "a text"))
 
 
 def texts(value: object) -> tuple[str, ...]:
     """Return a list of strings from a record; a single string becomes a list of one."""
     items = value.tolist() if isinstance(value, np.ndarray) else value
-    return tuple(map(text, items)) if isinstance(items, list | tuple) else (text(items),)
+    if isinstance(items, list | tuple):
+        return tuple(map(text, items))
+    return (text(items),)
 
 
 def figure(value: object) -> float:
@@ -145,7 +149,8 @@ def content_digest(entries: Mapping[str, object]) -> str:
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for key, value in sorted(entries.items()):
-            array = np.asarray(np.frombuffer(value, "u1") if isinstance(value, bytes) else value)
+            raw = np.frombuffer(value, "u1") if isinstance(value, bytes) else value
+            array = np.asarray(raw)
             digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
@@ -272,36 +277,49 @@ def _of_mat(value: Any) -> object:
     if value.dtype.names:
         return {name: _of_mat(value[name].item()) for name in value.dtype.names}
     if value.dtype.kind == "U":
-        rows = [str(row).rstrip() if value.size > 1 else str(row) for row in value.ravel()]
-        return rows if len(rows) > 1 else "".join(rows)  # an empty text has no rows
-    return [_of_mat(cell) for cell in value.ravel(order="F")] if value.dtype.kind == "O" else value
+        return _text_of_mat(value)
+    if value.dtype.kind == "O":
+        return [_of_mat(cell) for cell in value.ravel(order="F")]
+    return value
+
+
+def _text_of_mat(value: Array) -> list[str] | str:
+    """Return the rows of a MATLAB text, or a single string if it has at most one row."""
+    rows = [str(row) for row in value.ravel()]
+    if len(rows) > 1:
+        return [row.rstrip() for row in rows]
+    return "".join(rows)  # an empty text has no rows
 
 
 def _to_json(record: Mapping[str, object], checksummed: bool) -> bytes:
     def plain(value: object) -> object:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
-        return value.tolist() if isinstance(value, np.ndarray) else value
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        return value
 
     lines = (f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}" for k, v in record.items())
     body = ("{\n" + ",\n".join(lines)).encode()
-    checksum = f',\n"{CHECKSUM}": "{hashlib.sha256(body).hexdigest()}"' if checksummed else ""
-    return body + f"{checksum}\n}}\n".encode()
+    if checksummed:
+        checksum = hashlib.sha256(body).hexdigest()
+        body += f',\n"{CHECKSUM}": "{checksum}"'.encode()
+    return body + b"\n}\n"
 
 
 def _from_json(content: bytes) -> tuple[Record, bool]:
-    found = _JSON_CHECKSUM.search(content[-100:])
-    if found:
-        body = content[: len(content) - len(found.group())]
-        if hashlib.sha256(body).hexdigest().encode() != found.group(1):
+    checksum = _JSON_CHECKSUM.search(content[-100:])
+    if checksum:
+        body = content[: len(content) - len(checksum.group())]
+        if hashlib.sha256(body).hexdigest().encode() != checksum.group(1):
             raise ValueError(
                 f"{DAMAGED}; to read the file without this check, delete its last entry "
                 f"{CHECKSUM}, with the comma before it"
             )
     record: Record = json.loads(content)
-    if record.pop(CHECKSUM, None) is not None and not found:
+    if record.pop(CHECKSUM, None) is not None and not checksum:
         raise ValueError(f"its entry {CHECKSUM} is not written by fflin; delete this entry")
-    return record, bool(found)
+    return record, bool(checksum)
 
 
 # {ending: (writer, reader)} for each of `writing.RECORDS`
@@ -343,15 +361,15 @@ class Design(Result):
         write_record(writing.as_path(path), record_of(self), checksummed=self.verified)
 
     @classmethod
-    def _of(cls: type[Kind], *sources: object, **own: Any) -> Kind:
-        """Return a result with the fields `own`.
+    def _of(cls: type[Kind], *sources: object, **values: Any) -> Kind:
+        """Return a result with the fields `values`.
 
         Each other field is copied from the first source that has it.
         """
-        names = [each.name for each in fields(cls) if each.init]
+        names = [item.name for item in fields(cls) if item.init]
         for source in sources:
-            own = {key: getattr(source, key) for key in names if hasattr(source, key)} | own
-        return cls(**own)
+            values = {key: getattr(source, key) for key in names if hasattr(source, key)} | values
+        return cls(**values)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
@@ -385,12 +403,13 @@ def require_possible(values: Record, shapes: str = "") -> None:
     which is the same wherever the letter occurs.
     """
     for key, value in values.items():
-        if isinstance(value, float) and not (-_LARGEST if key != "dt" else 0) <= value <= _LARGEST:
+        least = 0.0 if key == "dt" else -_LARGEST
+        if isinstance(value, float) and not least <= value <= _LARGEST:
             raise ValueError(f"{key} is {value:g}, which is not possible")
         if key.endswith("_units") and len(value) != len(values[key.replace("units", "names")]):
             raise ValueError(f"the number of its {key} differs from the number of names")
     lengths: dict[str, int] = {}
-    for key, letters in (each.split(":") for each in shapes.split()):
+    for key, letters in (item.split(":") for item in shapes.split()):
         shape = np.shape(values[key])
         if tuple(map(lengths.setdefault, letters, shape)) != shape or len(shape) < len(letters):
             raise ValueError(f"{key} has shape {shape}, which contradicts other entries")
@@ -411,14 +430,16 @@ def record_of(design: Design) -> Record:
         value = getattr(design, item.name)
         if item.type == "Open":  # JSON has no infinity, so the largest double replaces it
             value = np.nan_to_num(value, nan=np.nan)
-        record[item.name] = list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple):
+            value = list(value)
+        record[item.name] = value
     return record
 
 
 def _saved(cls: type[Design]) -> list[Field[object]]:
     """Return the fields of a result that its file contains."""
-    own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
-    return [item for item in own if item.type != "Robot"]
+    saved = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
+    return [item for item in saved if item.type != "Robot"]
 
 
 def _value(item: Field[object], raw: object) -> Any:
@@ -432,9 +453,13 @@ def _value(item: Field[object], raw: object) -> Any:
     kinds = "fiuc" if item.type == "Poles" else "fiu"
     if array.dtype.kind not in kinds or not np.isfinite(array).all():
         raise ValueError(f"{item.name} is not an array of finite numbers")
-    array = array.astype(complex if array.dtype.kind == "c" else float)
+    dtype = complex if array.dtype.kind == "c" else float
+    array = array.astype(dtype)
     if item.type == "Open":
         array = np.where(np.abs(array) > _LARGEST, np.copysign(np.inf, array), array)
     # MATLAB stores vectors as matrices.
-    array = array.ravel() if item.type in ("Vector", "Poles") else array
-    return unit_pose(array) if item.name == "placement" else array
+    if item.type in ("Vector", "Poles"):
+        array = array.ravel()
+    if item.name == "placement":
+        array = unit_pose(array)
+    return array

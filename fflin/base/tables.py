@@ -26,7 +26,9 @@ _EPS = sys.float_info.epsilon
 
 def width() -> int:
     """Return the number of columns of the terminal, or 80 if the output is not a terminal."""
-    return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
+    if not _on_terminal():
+        return 80
+    return shutil.get_terminal_size((80, 24)).columns
 
 
 def folded(lines: Iterable[str]) -> str:
@@ -51,7 +53,9 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
     left = len(rows) - 1 - MOST_ROWS
     if left <= _SPARE:
         return list(rows)
-    return [*rows[: 1 + MOST_ROWS], [f"... and {left} more, {rest}", *[""] * (len(rows[0]) - 1)]]
+    empty_cells = [""] * (len(rows[0]) - 1)
+    last = [f"... and {left} more, {rest}", *empty_cells]
+    return [*rows[: 1 + MOST_ROWS], last]
 
 
 def dim(text: str) -> str:
@@ -75,12 +79,15 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
     align = align.ljust(len(sizes), "r")
     lines = []
     for row in rows:
-        cells = [
-            cell.ljust(size) if side == "l" else cell.rjust(size)
-            for cell, size, side in zip(row, sizes, align, strict=True)
-        ]
+        cells = []
+        for cell, size, side in zip(row, sizes, align, strict=True):
+            padded = cell.ljust(size) if side == "l" else cell.rjust(size)
+            cells.append(padded)
         cells[-1] = cells[-1].rstrip()
-        lines.append(_GAP.join(dim(c) if c.strip() == "." else c for c in cells).rstrip())
+        for column, cell in enumerate(cells):
+            if cell.strip() == ".":
+                cells[column] = dim(cell)
+        lines.append(_GAP.join(cells).rstrip())
     return "\n".join(lines)
 
 
@@ -126,22 +133,30 @@ def rounding(values: Array) -> Array:
 
 
 def _number(x: float, below: float) -> str:
-    return "." if x == 0.0 else "~0" if abs(x) < below else f"{x:.5g}"
+    if x == 0.0:
+        return "."
+    if abs(x) < below:
+        return "~0"
+    return f"{x:.5g}"
 
 
 def counted(number: int, thing: str) -> str:
     """Return a number with its noun, in the plural if needed."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
+    plural = "" if number == 1 else "s"
+    return f"{number} {thing}{plural}"
 
 
 def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
     """Format the nonzero entries of a state, an input or a force, with their units."""
     # Lines may break between entries, but not at the spaces within an entry.
-    entries = [
-        f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")
-        for name, value, unit in zip(names, values.tolist(), units, strict=True)
-        if value
-    ]
+    entries = []
+    for name, value, unit in zip(names, values.tolist(), units, strict=True):
+        if not value:
+            continue
+        entry = f"{name}\xa0=\xa0{value:.6g}"
+        if unit != "1":
+            entry += f"\xa0{unit}"
+        entries.append(entry)
     below = " " * (len(title) + 2)
     text = textwrap.fill(f"{title}: {', '.join(entries)}", width(), subsequent_indent=below)
     return text.replace("\xa0", " ")

@@ -53,10 +53,10 @@ class TomlFile:
                     raise ValueError(f"more than {_DOTS_LIMIT} dots in one line (at line {number})")
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
-            found = re.search(r"at line (\d+)", str(error))
+            place = re.search(r"at line (\d+)", str(error))
             # `start` is the index of the first byte that is not UTF-8.
             last = getattr(error, "start", len(content.rstrip()))
-            line = found[1] if found else content.count(b"\n", 0, last) + 1
+            line = place[1] if place else content.count(b"\n", 0, last) + 1
             message = f"{path}:{line}: invalid TOML: {error}; correct the file"
             raise InputError(message) from None
         # Multi-line strings are replaced by line breaks, which keeps the line numbers. One-line
@@ -109,8 +109,8 @@ class TomlFile:
         """
         head = "".join(f"{part}." for part in table)
         keys = [key.removeprefix(head) for key in self._lines if key.startswith(head)]
-        found = re.findall(r"'([^']+)'| (\S+) is ", message)
-        names = [name for one, other in found if (name := one or other.strip("'"))]
+        mentions = re.findall(r"'([^']+)'| (\S+) is ", message)
+        names = [name for one, other in mentions if (name := one or other.strip("'"))]
         for name in names:
             for key_path, value in _values(self.record):
                 if value == name and key_path[: len(table)] == table:
@@ -131,7 +131,9 @@ def flat(table: object) -> object:
         pairs = []
         for key, value in table.items():
             inner = value if isinstance(value, dict) and value else {"": value}
-            pairs += [(f"{key}.{below}" if below else key, x) for below, x in inner.items()]
+            for below, entry in inner.items():
+                name = f"{key}.{below}" if below else key
+                pairs.append((name, entry))
         table = dict(pairs)
     return table
 
@@ -154,10 +156,10 @@ def _lines_of(text: str) -> dict[str, int]:
     counts: dict[str, int] = {}
     table = ""
     for number, line in enumerate(text.split("\n"), start=1):
-        found = _LINE.match(line)
-        if not found:
+        match = _LINE.match(line)
+        if not match:
             continue
-        brackets, header, key = found.groups()
+        brackets, header, key = match.groups()
         name = ".".join(part.strip("\"'") for part in re.findall(_PART, header or key))
         if brackets:
             first, _, below = name.partition(".")

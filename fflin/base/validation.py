@@ -90,28 +90,28 @@ def number(name: str, value: Any) -> float:
 
 def positive(name: str, value: object, unit: str = "", hint: str = "") -> float:
     """Return a number above 0, or raise `InputError`."""
-    found = number(name, value)
-    if found <= 0.0:
-        shown = f"{found:g} {unit}".rstrip()
+    checked = number(name, value)
+    if checked <= 0.0:
+        shown = f"{checked:g} {unit}".rstrip()
         raise InputError(f"{name} is {shown}, expected more than 0{hint}")
-    return found
+    return checked
 
 
 def quantity(name: str, value: object, unit: str = "") -> float:
     """Return a number above 0 and up to `LARGEST`, or raise `InputError`."""
-    found = positive(name, value, unit)
-    if found > LARGEST:
-        shown = f"{found:g} {unit}".rstrip()
+    checked = positive(name, value, unit)
+    if checked > LARGEST:
+        shown = f"{checked:g} {unit}".rstrip()
         raise InputError(f"{name} is {shown}, expected at most {LARGEST:g}")
-    return found
+    return checked
 
 
 def share(name: str, value: object) -> float:
     """Return a fraction above 0 and below 1, or raise `InputError`."""
-    found = number(name, value)
-    if not 0.0 < found < 1.0:
-        raise InputError(f"{name} is {found:g}, expected a fraction between 0 and 1")
-    return found
+    fraction = number(name, value)
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"{name} is {fraction:g}, expected a fraction between 0 and 1")
+    return fraction
 
 
 def refuse_masked(name: str, value: object) -> None:
@@ -215,7 +215,9 @@ def normalised(what: str, value: Array) -> Array:
     error = abs(length - 1.0)
     if not error <= NORM_TOLERANCE:
         raise InputError(f"{what} has length {length:.9g}, expected 1; normalise it")
-    return value if error <= ROUND_OFF else value / length
+    if error <= ROUND_OFF:
+        return value
+    return value / length
 
 
 def placement(name: str, value: object) -> pin.SE3:
@@ -294,7 +296,9 @@ class Result(FrozenArrays):
 
     def __str__(self) -> str:
         report = self._report()
-        return report if self.verified else f"{report}\n{NOT_VERIFIED}"
+        if not self.verified:
+            report += f"\n{NOT_VERIFIED}"
+        return report
 
     def _report(self) -> str:
         return repr(self)

@@ -56,8 +56,9 @@ def read_file(
     If `replaceable`, the file is not registered as an input, so that it can be overwritten.
     """
     require_regular(path, kind, limit, replaceable=replaceable)
+    size = -1 if limit is None else limit
     with failing(path, "read"), path.open("rb") as file:
-        return file.read(-1 if limit is None else limit)
+        return file.read(size)
 
 
 def require_regular(
@@ -71,11 +72,11 @@ def require_regular(
     would block until another process writes into it, and a device may have no end.
     """
     with failing(path, "read"):
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            what = "a folder" if stat.S_ISDIR(found.st_mode) else "not a regular file"
-            raise FileError(f"{path}: is {what}; give the path of a {kind} file")
-    if limit is not None and found.st_size > limit:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            actual_kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+            raise FileError(f"{path}: is {actual_kind}; give the path of a {kind} file")
+    if limit is not None and status.st_size > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
     if not replaceable:
@@ -126,8 +127,8 @@ def remember(*paths: str | Path) -> None:
 def _require_other(target: Path, inputs: Iterable[str | Path]) -> None:
     for path in inputs:
         if same_file(path, target):
-            said = f"output {target} is the input file {os.path.abspath(path)}"
-            raise FileError(f"{said}; give another output file")
+            message = f"output {target} is the input file {os.path.abspath(path)}"
+            raise FileError(f"{message}; give another output file")
 
 
 def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
@@ -213,8 +214,8 @@ def check_distinct(*targets: Path | None) -> None:
     for first, target in combinations(filter(None, targets), 2):
         same = os.path.realpath(first) == os.path.realpath(target)
         if same or same_file(first, target):
-            said = f"outputs {target} and {first} are the same file"
-            raise FileError(f"{said}; give each output its own file")
+            message = f"outputs {target} and {first} are the same file"
+            raise FileError(f"{message}; give each output its own file")
 
 
 def missing(path: Path, otherwise: str = "") -> str:
@@ -229,22 +230,31 @@ def missing(path: Path, otherwise: str = "") -> str:
         names = os.listdir(folder)
     except OSError:
         return f": its folder does not exist{otherwise}"
-    few = names if len(names) < _MANY else []
-    near = difflib.get_close_matches(path.name, few, n=3, cutoff=0.75)
-    hint = f"; did you mean {', '.join(map(repr, near))}?" if near else otherwise
+    if len(names) >= _MANY:
+        names = []
+    near = difflib.get_close_matches(path.name, names, n=3, cutoff=0.75)
+    hint = otherwise
+    if near:
+        hint = f"; did you mean {', '.join(map(repr, near))}?"
     return f" in the folder {shown(folder)}{hint}"
 
 
 def reason(error: Exception) -> str:
     """Return in one line why a file could not be read or written."""
-    said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    if isinstance(error, KeyError) and said.strip("'").isidentifier():
-        said = f"it has no entry {said}"
-    ends = "the file ends too early" if isinstance(error, EOFError) else type(error).__name__
-    return " ".join(said.split()) or ends
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror
+    if isinstance(error, KeyError) and text.strip("'").isidentifier():
+        text = f"it has no entry {text}"
+    otherwise = type(error).__name__
+    if isinstance(error, EOFError):
+        otherwise = "the file ends too early"
+    return " ".join(text.split()) or otherwise
 
 
 def shown(path: str | Path) -> str:
     """Return a path for a message; a very long path is shortened to its two ends."""
     text = str(path)
-    return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"
+    if len(text) < 500:
+        return text
+    return f"{text[:60]} ... {text[-60:]}"

@@ -166,11 +166,13 @@ def grid(
             raise InputError(
                 f"joint '{name}' is on the grid and in joints=; give it in only one of the two"
             )
-        what = f"grid of joint '{name}'"
-        axis = validation.as_double(what, values)
-        validation.vector(what, axis, max(1, axis.size), "increasing values (k,), k > 0")
+        label = f"grid of joint '{name}'"
+        axis = validation.as_double(label, values)
+        validation.vector(label, axis, max(1, axis.size), "increasing values (k,), k > 0")
         if (np.diff(axis) <= 0.0).any():
-            raise InputError(f"{what} has values that do not increase, expected increasing numbers")
+            raise InputError(
+                f"{label} has values that do not increase, expected increasing numbers"
+            )
         checked[name] = frozen(axis)
     count = math.prod(map(len, checked.values()))
     if count > sys.maxsize:
@@ -231,11 +233,11 @@ def random_configurations(
 
 def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
     if given is not None:
-        what = f"range of '{joint.name}'"
-        low, high = validation.vector(what, given, 2, "(low, high)").tolist()
+        label = f"range of '{joint.name}'"
+        low, high = validation.vector(label, given, 2, "(low, high)").tolist()
         if not 0.0 <= high - low < math.inf:
-            said = f"{what} is {low:g} to {high:g}"
-            raise InputError(f"{said}, expected low <= high with a width that does not overflow")
+            message = f"{label} is {low:g} to {high:g}"
+            raise InputError(f"{message}, expected low <= high with a width that does not overflow")
         return low, high
     low, high = travel_of(robot.model, joint)
     if not joint.prismatic:
@@ -322,7 +324,8 @@ def checked_rows(
 
 def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None) -> Array:
     array = validation.as_double(name, value)
-    expected = f"({'N' if count is None else count}, {size})"
+    rows = "N" if count is None else count
+    expected = f"({rows}, {size})"
     if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):
         raise InputError(f"{name} has shape {array.shape}, expected {expected}: {of_what}")
     if not len(array):

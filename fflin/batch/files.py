@@ -143,10 +143,10 @@ def read_rows(
         return arrays, constant, texts, False
     constants = {key: arrays[key] for key in constant}
     varying = {key: value for key, value in arrays.items() if key not in constants}
-    own = {key: value for key, value in texts.items() if key != "request"}
+    checked_texts = {key: value for key, value in texts.items() if key != "request"}
     if not (
         chunk > 0
-        and np.array_equal(checksum, file_checksum(own, chunk, checksums, constants))
+        and np.array_equal(checksum, file_checksum(checked_texts, chunk, checksums, constants))
         and np.array_equal(checksums, _chunk_checksums(varying, chunk))
     ):
         raise ValueError(DAMAGED)
@@ -313,12 +313,12 @@ class FileStore:
         except FileError:
             raise
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-            hint = "; if no other run uses it, remove it to start again" * self.resumed
+            message = f"{self.part}: cannot be read or written: {writing.reason(error)}"
             if self.resumed and getattr(error, "errno", None) == errno.ENOSPC:
-                hint = "; free disk space, and make the same call again"
-            raise FileError(
-                f"{self.part}: cannot be read or written: {writing.reason(error)}{hint}"
-            ) from None
+                message += "; free disk space, and make the same call again"
+            elif self.resumed:
+                message += "; if no other run uses it, remove it to start again"
+            raise FileError(message) from None
 
     def finished(self, start: int, stop: int) -> bool:
         """Return whether a chunk is in the file and matches its checksum."""
@@ -414,5 +414,7 @@ def part_of(path: Path) -> Path:
 
     If `path` is a symbolic link, NAME is the path of its target.
     """
-    real = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    real = path
+    if os.path.islink(path):
+        real = Path(os.path.realpath(path))
     return real.with_name(real.name + ".part")

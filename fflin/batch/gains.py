@@ -176,11 +176,13 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     direct = at_rest and nu >= nv
     for index, L in enumerate(batch.B_lower):
         B = np.concatenate((np.zeros_like(L), L))
-        found: Solution | Gain | None = half_size(batch.A[0], B, Q, R) if direct else None
-        if found is None:
+        solution: Solution | Gain | None = None
+        if direct:
+            solution = half_size(batch.A[0], B, Q, R)
+        if solution is None:
             with located(f"point {index}"):
-                found = regulator(batch[index], Q, R)
-        K[index], residual[index], margin[index] = found.K, found.residual, found.margin
+                solution = regulator(batch[index], Q, R)
+        K[index], residual[index], margin[index] = solution.K, solution.residual, solution.margin
     return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 
@@ -219,23 +221,23 @@ class ScheduledFeedback(Feedback):
     def __post_init__(self) -> None:
         instance("lin", self.lin, LinearModel, "a LinearModel")
         instance("gains", self.gains, GainBatch, "a GainBatch")
-        lin, by = self.lin, self.gains
-        here = [k for k, x in enumerate(by.joint_names) if f"q_m.{x}" in lin.state_names]
+        lin, gains = self.lin, self.gains
+        columns = [k for k, x in enumerate(gains.joint_names) if f"q_m.{x}" in lin.state_names]
         lined = replace(
-            by,
-            K=line_up(by, lin),
+            gains,
+            K=line_up(gains, lin),
             state_names=lin.state_names,
             input_names=lin.input_names,
-            joint_names=tuple(by.joint_names[k] for k in here),
-            joint_positions=by.joint_positions[:, here],
+            joint_names=tuple(gains.joint_names[k] for k in columns),
+            joint_positions=gains.joint_positions[:, columns],
         )
         self.gains = lined
         _ = lined.grid
 
     def table(self) -> tuple[dict[str, Array], Array]:
         """Return the grid axes {joint: values} and the gains (N, nu, nx) in grid order."""
-        by = self.gains
-        return by.grid, by._interpolator.values.reshape(by.K.shape)
+        gains = self.gains
+        return gains.grid, gains._interpolator.values.reshape(gains.K.shape)
 
     def form(self, robot: Robot) -> StateForm:
         """Return the grid and its gains."""

@@ -132,12 +132,12 @@ class LinearBatch(ModelHeader):
                     "a slice, a list of integers or a mask"
                 )
         count = len(np.empty(len(self), dtype=bool)[index])
-        rows: dict[str, Any] = {
-            key: np.broadcast_to(value[0], (count, *value.shape[1:]))
-            if is_constant(value)
-            else frozen(value[index])
-            for key, value in self._arrays().items()
-        }
+        rows: dict[str, Any] = {}
+        for key, value in self._arrays().items():
+            if is_constant(value):
+                rows[key] = np.broadcast_to(value[0], (count, *value.shape[1:]))
+            else:
+                rows[key] = frozen(value[index])
         return replace(self, **rows)
 
     def __iter__(self) -> Iterator[LinearModel]:
@@ -152,12 +152,16 @@ class LinearBatch(ModelHeader):
     @property
     def x0(self) -> Array:
         """States at the points (N, nx); computed at each access if all points have the same A."""
-        return self._states_at_rest(self.q) if self._x0 is None else self._x0
+        if self._x0 is None:
+            return self._states_at_rest(self.q)
+        return self._x0
 
     @property
     def y0(self) -> Array:
         """Outputs at the points (N, ny)."""
-        return self.x0 if self._y0 is None else self._y0
+        if self._y0 is None:
+            return self.x0
+        return self._y0
 
     @property
     def placements(self) -> Array:
@@ -194,8 +198,8 @@ class LinearBatch(ModelHeader):
             If a value is not a finite number, or no value is given.
         """
         distance = np.zeros(len(self))
-        for what, at, turning, value in self._named(joints):
-            distance += _apart(at, turning, validation.number(what, value)) ** 2
+        for label, at, turning, value in self._named(joints):
+            distance += _apart(at, turning, validation.number(label, value)) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -209,12 +213,12 @@ class LinearBatch(ModelHeader):
             If a value is not a number or a range, or no point of the batch matches.
         """
         mask = np.ones(len(self), dtype=bool)
-        for what, at, turning, value in self._named(joints):
+        for label, at, turning, value in self._named(joints):
             if isinstance(value, tuple | list):
-                low, high = validation.vector(what, value, 2, "(low, high)")
+                low, high = validation.vector(label, value, 2, "(low, high)")
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= _apart(at, turning, validation.number(what, value)) <= _SAME
+                mask &= _apart(at, turning, validation.number(label, value)) <= _SAME
         if not mask.any():
             raise InputError(
                 f"no point of the batch has {dict(joints)}; use `nearest` to find the nearest point"
@@ -298,30 +302,32 @@ class LinearBatch(ModelHeader):
         with reading(source, "batch"):
             arrays, constant, texts, verified = read_rows(source, verify=verify)
             header = json.loads(texts["header"])
-            found = _checked_fields(arrays, header, constant)
+            values = _checked_fields(arrays, header, constant)
             ignorable = tuple(header["_ignorable"])
             # Files of earlier versions do not contain the wheels.
-            wheels = FlownWheels(*map(tuple, header["_wheels"])) if "_wheels" in header else None
+            wheels = None
+            if "_wheels" in header:
+                wheels = FlownWheels(*map(tuple, header["_wheels"]))
             n = float(header["mean_motion"])
         if robot is None:
             asked = {
-                "_certify": partial(_refuse, "certificate", found["robot"]),
-                "_inertia": partial(_refuse, "inertia M", found["robot"]),
+                "_certify": partial(_refuse, "certificate", values["robot"]),
+                "_inertia": partial(_refuse, "inertia M", values["robot"]),
                 "_ignorable": partial(given, ignorable),
                 "_wheels": wheels,
                 **{"weights": {}, "mean_motion": n, "dt": 0.0},
             }
-            return LinearBatch(**found, _asked=asked, verified=verified)
-        own = robot.urdf_sha256, robot.locked, robot.joint_names, mean_motion(robot)
-        if own != (found["urdf_sha256"], found["locked"], _joints(found["state_names"]), n):
+            return LinearBatch(**values, _asked=asked, verified=verified)
+        identity = robot.urdf_sha256, robot.locked, robot.joint_names, mean_motion(robot)
+        if identity != (values["urdf_sha256"], values["locked"], _joints(values["state_names"]), n):
             raise InputError(
-                f"robot '{robot.name}' differs from the robot '{found['robot']}' of the batch in "
+                f"robot '{robot.name}' differs from the robot '{values['robot']}' of the batch in "
                 "its URDF, joints or orbit; give the robot for which the batch was made"
             )
         from fflin.linear.linearization import Prepared
 
-        ready = Prepared(robot, frame=found["frame"], reference=None, moving=found["moving"])
-        return LinearBatch(**found, _asked=ready.common, verified=verified)
+        ready = Prepared(robot, frame=values["frame"], reference=None, moving=values["moving"])
+        return LinearBatch(**values, _asked=ready.common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
         """Return {name: array} of all arrays of the batch; each array has one row per point."""
@@ -365,8 +371,10 @@ class LinearBatch(ModelHeader):
         """Return the joint positions q_m (N, n) [rad|m] at configurations q (N, nq)."""
         q_m = np.empty((len(q), len(self.columns)))
         for k, (first, second, scale) in enumerate(self.columns):
-            at = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
-            q_m[:, k] = at / scale
+            position = q[:, first]
+            if second >= 0:
+                position = np.arctan2(q[:, second], q[:, first])
+            q_m[:, k] = position / scale
         return q_m
 
     def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Array, bool, Any]]:
@@ -397,23 +405,25 @@ def _checked_fields(
 ) -> dict[str, Any]:
     """Return the fields of a batch from its file; raise `ValueError` for a wrong shape or type."""
     count = int(header["points"])
-    found: dict[str, Any] = dict.fromkeys(_OPTIONAL_ARRAYS)
+    values: dict[str, Any] = dict.fromkeys(_OPTIONAL_ARRAYS)
     for key in (*_ARRAYS, *(arrays.keys() & set(_OPTIONAL_ARRAYS))):
         array = arrays[key]
         if key in constant:
             array = np.broadcast_to(array, (count, *array.shape))
         if array.dtype != np.float64 or len(array) != count:
             raise ValueError(f"{key} has {len(array)} rows of {array.dtype}, expected {count}")
-        found[key] = frozen(array)
+        values[key] = frozen(array)
     for key in TEXTS:
-        found[key] = tuple(header[key]) if isinstance(header[key], list) else header[key]
-    found["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
-    nx, nu, ny = (len(found[f"{kind}_names"]) for kind in ("state", "input", "output"))
+        values[key] = header[key]
+        if isinstance(header[key], list):
+            values[key] = tuple(header[key])
+    values["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
+    nx, nu, ny = (len(values[f"{kind}_names"]) for kind in ("state", "input", "output"))
     shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
     for key, shape in shapes.items():
-        if found[key].shape[1:] != shape:
-            raise ValueError(f"{key} has shape {found[key].shape[1:]} per point, expected {shape}")
-    return found
+        if values[key].shape[1:] != shape:
+            raise ValueError(f"{key} has shape {values[key].shape[1:]} per point, expected {shape}")
+    return values
 
 
 def _apart(at: Array, turning: bool, value: float) -> Array:

@@ -102,7 +102,9 @@ class Execution(ExitStack):
     def count(self, job: Job) -> int:
         """Return how many chunks of a job are computed in parallel."""
         if self.executor is None:
-            return self._threads if job.threaded else 1
+            if job.threaded:
+                return self._threads
+            return 1
         for name in ("_max_workers", "num_workers"):
             count = getattr(self.executor, name, None)
             if isinstance(count, int) and count > 0:
@@ -197,7 +199,7 @@ def _results(
 ) -> Iterator[tuple[Span, Result | str]]:
     """Yield each chunk with its result, or with the reason why it failed."""
 
-    def here(start: int, stop: int) -> Result | str:
+    def compute(start: int, stop: int) -> Result | str:
         out = store.view(start, stop, job.shapes)
         try:
             return out, job.run(rows(start, stop), start, out)
@@ -208,14 +210,14 @@ def _results(
     inside = how.executor is None
     if inside and (count == 1 or len(spans) == 1):
         for span in spans:
-            yield span, here(*span)
+            yield span, compute(*span)
         return
     pool = how.executor or futures.ThreadPoolExecutor(count)
     pickled = b"" if inside else pickle.dumps(job)
 
     def submit(start: int, stop: int) -> futures.Future[Result | str]:
         if inside:
-            return pool.submit(here, start, stop)
+            return pool.submit(compute, start, stop)
         return pool.submit(work, pickled, rows(start, stop), start, stop)
 
     waiting, running = deque(spans), dict[futures.Future[Result | str], Span]()
@@ -288,9 +290,10 @@ def _failure(
         stop = start + store.chunk
         kept[start:stop] = store.finished(start, min(stop, store.count))
     numbers = listed(f"{start} to {stop - 1}" for start, stop, _ in failed)
+    verb = "has" if len(failed) == 1 else "have"
     message = (
-        f"{len(failed)} of {-(-store.count // store.chunk)} chunks "
-        f"{'has' if len(failed) == 1 else 'have'} failed, {of_what} {numbers}: {failed[0][2]}"
+        f"{len(failed)} of {-(-store.count // store.chunk)} chunks {verb} failed, {of_what} "
+        f"{numbers}: {failed[0][2]}"
     )
     batch = None
     if not kept.any():
@@ -320,8 +323,10 @@ class OwnWorkers(futures.ThreadPoolExecutor):
     def __init__(self, count: int) -> None:
         cores = available_cores()
         if count > cores:
-            said = f"{count} workers requested, but only {cores} cores are available; using {cores}"
-            warnings.warn(said, FflinWarning, stacklevel=4)
+            message = (
+                f"{count} workers requested, but only {cores} cores are available; using {cores}"
+            )
+            warnings.warn(message, FflinWarning, stacklevel=4)
         super().__init__(min(count, cores))
         self._mine, self._lock = local(), Lock()
         self._pools: list[futures.ProcessPoolExecutor] = []

@@ -244,11 +244,13 @@ class ChunkJob:
                     if self.only_inertia:
                         self.linearizer.write_by_u(rows["q"][row], out["B_lower"][row])
                         continue
-                    point = {key: each[row] for key, each in rows.items()}
+                    point = {key: values[row] for key, values in rows.items()}
                     lin = self.linearizer(point["q"], point.get("v"), point.get("u0"))
                     for key, array in out.items():
-                        lower = key == "B_lower"
-                        array[row] = lin.B[nv:] if lower else getattr(lin, key.removeprefix("_"))
+                        if key == "B_lower":
+                            array[row] = lin.B[nv:]
+                        else:
+                            array[row] = getattr(lin, key.removeprefix("_"))
         return [str(note.message) for note in caught]
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
@@ -285,9 +287,15 @@ class ChunkJob:
         state = ready.map
         actuation = ready.actuation
         count = len(q)
-        own = ready.own_reference
-        chart: Chart = Standing(count) if own else state.charts(q)
-        r_b: Array = np.zeros((count, 3)) if own else state.positions(q)
+        own_reference = ready.own_reference
+        chart: Chart
+        r_b: Array
+        if own_reference:
+            chart = Standing(count)
+            r_b = np.zeros((count, 3))
+        else:
+            chart = state.charts(q)
+            r_b = state.positions(q)
         nu: Array = np.zeros((count, B.shape[1]))
         u: Array = np.zeros((count, B.shape[2]))
         if "v" in rows:
@@ -331,8 +339,12 @@ class SweepTask:
         # contains the given arrays. A single v or u for all points is broadcast to one row per
         # point.
         points = checked_points(robot, q)
-        self._points = None if isinstance(points, np.ndarray) else points
-        self._known = {"q": points} if isinstance(points, np.ndarray) else {}
+        self._points: Configurations | None = None
+        self._known: dict[str, Array] = {}
+        if isinstance(points, np.ndarray):
+            self._known["q"] = points
+        else:
+            self._points = points
         self.count = count = len(points)
         if v is not None:
             every = bool(robot.followers)
@@ -361,8 +373,12 @@ class SweepTask:
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
         """Return the configurations, velocities and inputs of points start to stop - 1."""
-        drawn = {"q": self._points.rows(start, stop)} if self._points else {}
-        return {**drawn, **{key: rows[start:stop] for key, rows in self._known.items()}}
+        rows: dict[str, Array] = {}
+        if self._points:
+            rows["q"] = self._points.rows(start, stop)
+        for key, values in self._known.items():
+            rows[key] = values[start:stop]
+        return rows
 
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
         """Assemble a batch from the arrays that vary between points."""
@@ -374,11 +390,11 @@ class SweepTask:
             rows[key] = frozen(arrays[key].view())
         common = self.job.linearizer.prepared.common
         rows |= {key: common[key] for key in TEXTS}
-        columns = tuple(
-            (joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1, joint.scale)
-            for joint in self.robot.joints
-        )
-        return LinearBatch(**rows, columns=columns, _asked=common)
+        columns = list[tuple[int, int, float]]()
+        for joint in self.robot.joints:
+            second = joint.idx_q + 1 if joint.unbounded else -1
+            columns.append((joint.idx_q, second, joint.scale))
+        return LinearBatch(**rows, columns=tuple(columns), _asked=common)
 
     def header(self) -> dict[str, str]:
         """Return the header of a file of the batch."""
@@ -402,7 +418,7 @@ class SweepTask:
         return content_digest(
             {
                 "robot": repr(settings),
-                "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
+                "model": np.concatenate([np.ravel(matrix) for matrix in (*inertias, *placements)]),
                 "reference": pin.SE3ToXYZQUAT(prepared.map.reference),
                 **self._known,
                 **{f"of q: {key}": value for key, value in points.items()},

@@ -110,8 +110,10 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
         A, B = transformed(change.own, change.to, batch.A[rows], batch.B[rows])
         rate = rates @ change.to.P.T
         if step:
-            stepped = [euler_step(*each, step, tool) for each in zip(A, B, rate, strict=True)]
-            A, B, rate = (np.array(each) for each in zip(*stepped, strict=True))
+            stepped = [
+                euler_step(*matrices, step, tool) for matrices in zip(A, B, rate, strict=True)
+            ]
+            A, B, rate = (np.array(matrices) for matrices in zip(*stepped, strict=True))
         converted = {
             "A": A,
             "B": B,
@@ -126,7 +128,7 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
                 stacks[name] = np.empty((len(batch), *value.shape[1:]))
             stacks[name][rows] = value
     vectors = [kind.vectors(q, v) for q, v in zip(batch.q, batch.v, strict=True)]
-    q, v = (np.array(each) for each in zip(*vectors, strict=True))
+    q, v = (np.array(values) for values in zip(*vectors, strict=True))
     positions = np.zeros_like(v) if kind.tangent else q
     for stack in stacks.values():
         frozen(stack)
@@ -181,12 +183,12 @@ class _Points:
         first = rows[0]
         reference = pin.XYZQUATToSE3(self._placements[first])
         state = StateMap(self._robot, reference=reference, frame=batch.frame)
-        own = ToolCoordinates(state, moving=batch.moving)
+        model_coordinates = ToolCoordinates(state, moving=batch.moving)
         nu, q, drift = self._nu[first], batch.q[first], self._drift[rows]
-        u = own.actuation.in_base_axes(state.chart(q), batch.u0[first])
+        u = model_coordinates.actuation.in_base_axes(state.chart(q), batch.u0[first])
         if batch._drift is None:  # f0 = P dy/dt
-            drift = drift @ own.jacobians(q, nu, u, 0.0 * nu).left.T
+            drift = drift @ model_coordinates.jacobians(q, nu, u, 0.0 * nu).left.T
         accelerations = drift[:, len(nu) :]
         at = q, nu, u, accelerations[0]
-        change = _Change(own.jacobians(*at), self._kind.jacobians(*at))
+        change = _Change(model_coordinates.jacobians(*at), self._kind.jacobians(*at))
         return change, np.hstack((self._nu[rows], accelerations))

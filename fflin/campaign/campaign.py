@@ -74,11 +74,15 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
         sign = match[2]
         limit = float(match[3])
         unit = match[4]
-        values, own = figure(name)
-        factors = [_FACTORS.get((unit, each), 0.0) for each in own.split("|")]
-        factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
+        values, figure_unit = figure(name)
+        alternatives = figure_unit.split("|")
+        factor = 1.0
+        if unit not in ("", figure_unit, *alternatives):
+            factor = max(_FACTORS.get((unit, alternative), 0.0) for alternative in alternatives)
         if not factor:
-            raise InputError(f"condition {part!r} has the unit {unit}, expected {own or 'no unit'}")
+            raise InputError(
+                f"condition {part!r} has the unit {unit}, expected {figure_unit or 'no unit'}"
+            )
         limit *= factor
         bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit)))
     return bounds
@@ -221,13 +225,13 @@ class Campaign(FrozenArrays):
         contains such a comparison, the default is ``worst KIND``, where KIND is the first of
         ``attitude``, ``position`` and ``joints`` that the policy controls.
         """
-        bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
+        bounded = [bound.name for bound in self.bounds if bound.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
 
     @property
     def bounds(self) -> list[Bound]:
         """All comparisons of a figure with a number in the goals."""
-        return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
+        return [bound for goal in self.goals for bound in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
         """Return the named figure of every run (N,), in SI units; attitude errors are in deg."""
@@ -241,16 +245,16 @@ class Campaign(FrozenArrays):
         if name == "settle":
             at = [list(KINDS).index(kind) for kind in self.judged]
             return self.settle[:, at].max(axis=1, initial=0.0), "s"
-        of, _, rest = name.partition(" ")
-        if of not in ("worst", "settle", "drawn"):
-            of = "final"
+        statistic, _, rest = name.partition(" ")
+        if statistic not in ("worst", "settle", "drawn"):
+            statistic = "final"
             rest = name
         indices = {WHEEL_SPEEDS: self._indices("qdot_m", self.wheels)}
         indices[MODES] = self._indices("q_m", self.modes)
-        if indices.get(rest) and of in ("final", "worst"):
+        if indices.get(rest) and statistic in ("final", "worst"):
             at = indices[rest]
             errors = self.largest_x[:, at]
-            if of == "final":
+            if statistic == "final":
                 errors = np.abs(self.x[:, at] - np.array(self.x_end)[at])
             return np.where(self.stopped, np.inf, errors.max(axis=1)), self.state_units[at[0]]
         states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
@@ -260,13 +264,15 @@ class Campaign(FrozenArrays):
             "worst": [(*kinds, self.largest), (*states, self.largest_x), (*inputs, self.largest_u)],
             "settle": [(kinds[0], ("s",) * len(KINDS), self.settle)],
             "drawn": [(self.names, ("",) * len(self.names), self.drawn)],
-        }[of]
+        }[statistic]
         for names, units, arrays in groups:
             if rest in names:
                 values, unit = arrays[:, names.index(rest)], units[names.index(rest)]
-                bounded = of == "worst" or arrays is self.errors
-                return (np.where(self.stopped, np.inf, values) if bounded else values), unit
-        known = [each for names, *_ in groups for each in names]
+                bounded = statistic == "worst" or arrays is self.errors
+                if bounded:
+                    values = np.where(self.stopped, np.inf, values)
+                return values, unit
+        known = [name for names, *_ in groups for name in names]
         raise unknown("figure", rest, [*known, *(name for name, at in indices.items() if at)])
 
     def _indices(self, group: str, joints: tuple[str, ...]) -> list[int]:
@@ -285,13 +291,14 @@ class Campaign(FrozenArrays):
         """
         if not isinstance(condition, str):
             dimension("condition", condition)  # refuses rows of different lengths
-            found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
-            if found.shape != (len(self),) or found.dtype != bool:
+            given = condition if isinstance(condition, np.ndarray | list) else None
+            mask = np.asarray(given)
+            if mask.shape != (len(self),) or mask.dtype != bool:
                 raise InputError(
-                    f"condition has shape {found.shape} of {found.dtype}, expected a text such as "
+                    f"condition has shape {mask.shape} of {mask.dtype}, expected a text such as "
                     f"'attitude < 1 deg', or ({len(self)},) booleans"
                 )
-            return found
+            return mask
         met = ~self.stopped
         for bound in bounds_of(condition, self.figure):
             met = met & bound.met
@@ -350,15 +357,19 @@ class Campaign(FrozenArrays):
         the value, or ``|NAME|`` for the distance. For example, the distance is more informative for
         a figure that grows with an initial error of either sign. The default figure is `about`.
         """
-        figure = self.values(self.about if name is None else name)
+        name = self.about if name is None else name
+        figure = self.values(name)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
         signed, sized = (intervals.rank_correlations(x, figure) for x in (self.drawn, apart))
-        found = {
-            f"|{key}|" if abs(size) > abs(value) else key: max(value, size, key=abs)
-            for key, value, size in zip(self.names, signed.tolist(), sized.tolist(), strict=True)
-            if key != SEED
-        }
-        return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
+        correlations = {}
+        for key, value, size in zip(self.names, signed.tolist(), sized.tolist(), strict=True):
+            if key == SEED:
+                continue
+            if abs(size) > abs(value):
+                correlations[f"|{key}|"] = size
+            else:
+                correlations[key] = value
+        return dict(sorted(correlations.items(), key=lambda pair: -abs(pair[1])))
 
     def replay(
         self, run: int, *, robot: Robot | None = None, policy: object = None, **options: object
@@ -494,7 +505,9 @@ class Campaign(FrozenArrays):
         run = np.asarray(arrays["stop"]) != NOT_RUN
         values = dict[str, Any]()
         for key in ARRAYS:
-            values[key] = arrays[key] if run.all() else arrays[key][run]
+            values[key] = arrays[key]
+            if not run.all():
+                values[key] = arrays[key][run]
         # Files of earlier versions do not contain these fields.
         header = {
             "notes": [],

@@ -82,15 +82,16 @@ class Dispersions:
             if kind not in kinds or not head:
                 head = str(key)
                 kind = "delay" if key == "delay" else "state"
-            own, tied = untied(str(key), spread)
-            if kind == "fails" and isinstance(own, int | float):
+            plain_spread, tied = untied(str(key), spread)
+            group = str(key) if tied else ""
+            if kind == "fails" and isinstance(plain_spread, int | float):
                 raise InputError(
-                    f"'{key}' is {own:g}, a standard deviation, but a time of failure needs "
-                    "another description; give (least, largest) in s, a list of times in s or a "
-                    "distribution"
+                    f"'{key}' is {plain_spread:g}, a standard deviation, but a time of failure "
+                    "needs another description; give (least, largest) in s, a list of times in s "
+                    "or a distribution"
                 )
-            inverse = inverse_of(str(key), own, fixed=kind == "noise")
-            by_kind.setdefault(kind, {})[head] = inverse, str(key) if tied else ""
+            inverse = inverse_of(str(key), plain_spread, fixed=kind == "noise")
+            by_kind.setdefault(kind, {})[head] = inverse, group
         if not by_kind:
             raise InputError(
                 "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
@@ -111,9 +112,9 @@ class Dispersions:
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
             masses += ((x.name, at) for x in self.columns if x.kind == kind for at in x.at)
-        for (name, at), (other, of) in combinations(masses, 2):
-            one, two = pieces[at], pieces[of]
-            if at == of or (one.joint == two.joint and (one.whole or two.whole)):
+        for (name, at), (other, other_at) in combinations(masses, 2):
+            one, two = pieces[at], pieces[other_at]
+            if at == other_at or (one.joint == two.joint and (one.whole or two.whole)):
                 raise InputError(
                     f"'{name}' and '{other}' disperse the same mass; disperse only one of them"
                 )
@@ -142,32 +143,34 @@ class Dispersions:
         try:
             if kind in _OF_BODIES:
                 spreads, written = self._by_piece(kind, spreads)
-            found = by_name(f"{kind} to disperse", spreads, names)
+            spread_of_index = by_name(f"{kind} to disperse", spreads, names)
         except UnknownNameError as error:
-            hint = f"; or NAME.({kinds})" * (kind == "state")
-            raise UnknownNameError(f"{error}{hint}") from None
+            message = str(error)
+            if kind == "state":
+                message += f"; or NAME.({kinds})"
+            raise UnknownNameError(message) from None
         nominal = robot.springs._asdict()
         of_modes = robot.springs.stiffness[self._modes]
         factors = {**nominal, "frequency": of_modes}.get(kind)
         draws: dict[str, tuple[Inverse, list[int]]] = {}
-        for at, (inverse, tied) in sorted(found.items()):
-            own = names[at]
+        for at, (inverse, tied) in sorted(spread_of_index.items()):
+            title = names[at]
             if kind not in ("state", "delay"):
-                own = f"{written.get(own, own)}.{kind}"
+                title = f"{written.get(title, title)}.{kind}"
             if factors is not None and not factors[at]:
                 raise InputError(
-                    f"'{own}' is dispersed by a factor, but its nominal value is 0; remove the "
+                    f"'{title}' is dispersed by a factor, but its nominal value is 0; remove the "
                     "dispersion, or give the robot a nonzero value"
                 )
             if kind == "misalignment" and group_of(names[at]) == JointTorque.GROUP:
                 raise InputError(
-                    f"'{own}' is dispersed, but the motor of a joint cannot be misaligned with the "
-                    "joint; only thrusters, wheels, tau_b and F_b can be misaligned"
+                    f"'{title}' is dispersed, but the motor of a joint cannot be misaligned with "
+                    "the joint; only thrusters, wheels, tau_b and F_b can be misaligned"
                 )
-            draws.setdefault(tied or own, (inverse, []))[1].append(at)
-        for own, (inverse, targets) in draws.items():
+            draws.setdefault(tied or title, (inverse, []))[1].append(at)
+        for title, (inverse, targets) in draws.items():
             for axis, letter in enumerate(_AXES.get(kind, " ")):
-                name = f"{own}.{letter}".rstrip(". ")
+                name = f"{title}.{letter}".rstrip(". ")
                 self.columns.append(Column(name, kind, targets, axis, inverse))
 
     def _by_piece(
@@ -180,7 +183,7 @@ class Dispersions:
         overrides patterns that match these links.
         """
         robot = self._plant.robot
-        found = dict[str, tuple[Inverse, str]]()
+        spread_of_piece = dict[str, tuple[Inverse, str]]()
         named = dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         whole = set[int]()
@@ -190,15 +193,15 @@ class Dispersions:
                     raise InputError(
                         f"'{named[name]}' and '{key}' are the same link; give its {kind} only once"
                     )
-                found[name] = spreads[key]
+                spread_of_piece[name] = spreads[key]
                 if key in alone:
                     named[name] = key
                     if robot.pieces[name].whole:
                         whole.add(robot.pieces[name].joint)
-        for name in found.keys() - named:
+        for name in spread_of_piece.keys() - named:
             if robot.pieces[name].joint in whole:
-                del found[name]
-        return found, named
+                del spread_of_piece[name]
+        return spread_of_piece, named
 
     def drawn(self, start: int, stop: int) -> Array:
         """Return the drawn values (N, k) of runs start to stop - 1.
@@ -252,17 +255,17 @@ class Dispersions:
                         f"for which no valid robot exists; expected{bound}. Use a smaller standard "
                         "deviation, or a uniform distribution (least, largest)"
                     )
-            said = f"an invalid initial attitude is drawn in the runs from {start} on"
+            problem = f"an invalid initial attitude is drawn in the runs from {start} on"
             try:
                 self.starts(drawn)
                 # A drawn mass or inertia can be too small for the flexible modes of its body.
                 if self._plant.robot.appendages:
                     refused = first_impossible(self._plant.robot, self.bodies(drawn))
                     if refused is not None:
-                        said = f"run {start + refused} draws an invalid mass or inertia"
+                        problem = f"run {start + refused} draws an invalid mass or inertia"
                         self.one(drawn[refused])
             except (ChartError, InputError) as error:
-                raise InputError(f"{said}: {error}; use a smaller dispersion") from None
+                raise InputError(f"{problem}: {error}; use a smaller dispersion") from None
 
     def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
         """Return the values (N, size) or (N, size, axes) of all quantities of a kind of dispersion.
@@ -271,11 +274,13 @@ class Dispersions:
         kind. Quantities that are not dispersed have the value `rest`.
         """
         axes = len(_AXES.get(kind, " "))
-        found = np.full((len(drawn), len(self._known[kind]), axes), rest)
+        kind_values = np.full((len(drawn), len(self._known[kind]), axes), rest)
         for values, column in zip(drawn.T, self.columns, strict=True):
             if column.kind == kind:
-                found[:, column.at, column.axis] = values[:, None]
-        return found if axes > 1 else found[..., 0]
+                kind_values[:, column.at, column.axis] = values[:, None]
+        if axes == 1:
+            kind_values = kind_values[..., 0]
+        return kind_values
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
         """Return the initial configurations (N, nq) and velocities (N, nv)."""
@@ -297,11 +302,13 @@ class Dispersions:
         changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4); at first, only their changes
         for at in sorted(dispersed):
             joint = pieces[at].joint
-            own = model.getJointId(robot.model.names[joint]) if joint > ROOT else ROOT
+            bare_joint = ROOT
+            if joint > ROOT:
+                bare_joint = model.getJointId(robot.model.names[joint])
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            changed[own] = changed.get(own, 0.0) + varied(pieces[at], *changes)
-        for own, change in changed.items():
-            changed[own] = model.inertias[own].toPseudoInertia().toMatrix() + change
+            changed[bare_joint] = changed.get(bare_joint, 0.0) + varied(pieces[at], *changes)
+        for bare_joint, change in changed.items():
+            changed[bare_joint] = model.inertias[bare_joint].toPseudoInertia().toMatrix() + change
         return dict(zip(changed, map(properties, changed.values()), strict=True))
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
@@ -309,7 +316,7 @@ class Dispersions:
 
         A property that no dispersion changes is omitted.
         """
-        found = dict[str, Array]()
+        springs = dict[str, Array]()
         # The stiffness of a mode is proportional to w^2, and its damping to zeta w. Here w is the
         # frequency. The damping ratio zeta does not change with w.
         frequency = 1.0 + self._of("frequency", drawn)
@@ -317,8 +324,8 @@ class Dispersions:
             if self._kinds & {kind, "frequency"}:
                 factor = 1.0 + self._of(kind, drawn)
                 factor[:, self._modes] *= frequency**power
-                found[kind] = factor * getattr(self._plant.robot.springs, kind)
-        return found
+                springs[kind] = factor * getattr(self._plant.robot.springs, kind)
+        return springs
 
     def _faults(self, drawn: Array) -> ActuatorFaults | None:
         """Return the actuator faults of N runs, or None if no fault is dispersed."""
@@ -401,11 +408,11 @@ class Dispersions:
                 policy = _Bound(policy, plant.robot)
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         faults = self._faults(rows)
-        own = None
+        actuator_faults = None
         if faults is not None:
             first = [values[0] for values in faults]
-            own = ActuatorFaults(*first)
-        return Plant(state, plant.disturbance, own), policy, q[0], v[0]
+            actuator_faults = ActuatorFaults(*first)
+        return Plant(state, plant.disturbance, actuator_faults), policy, q[0], v[0]
 
 
 @dataclass(eq=False)
@@ -436,7 +443,9 @@ def _with_sensor_errors(policy: Policy, bias: Array, deviation: Array, seed: Arr
 
     def error(t: float) -> Array:
         drawn: Array = bias + deviation * generator.standard_normal(len(bias))
-        return drawn if given is None else drawn + np.asarray(given(t))
+        if given is not None:
+            drawn = drawn + np.asarray(given(t))
+        return drawn
 
     return policy.with_sensor_errors(error)
 
@@ -459,8 +468,8 @@ def turned(direction: object, angles: Array) -> Array:
     first, second, along = turned_to(np.array(direction, dtype=float)).T
     size = np.linalg.norm(angles, axis=1)[:, None]
     side = angles[:, 1:] * first - angles[:, :1] * second
-    found: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
-    return found
+    directions: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
+    return directions
 
 
 def _misaligned(robot: Robot, angles: Array) -> Robot:
@@ -485,7 +494,7 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
     fixed = np.tile(tree.fixed, (count, 1)).reshape(count, -1, 12)
     bodies = np.zeros((count, tree.bodies.size // 10, 10))
     inputs, storing = tree.input.tolist(), tree.stored_body.tolist()
-    for _, item, own, at, before in _mounted(robot):
+    for _, item, actuator_names, at, before in _mounted(robot):
         joint, placement = find_frame(model, item.frame)
         body = names.index(model.names[joint]) - ROOT
         axes = tree.axes[body].T @ placement.rotation
@@ -498,15 +507,15 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
         if isinstance(item, ReactionWheel) and item.momentum:
             stored[:, storing.index(body)] += item.momentum * row_products(after - before, axes.T)
         if isinstance(item, ReactionWheel) and item.inertia:
-            wheel = names.index(own[0]) - ROOT
-            fixed[:, wheel, :9] = [(axes @ turned_to(each)).ravel("F") for each in after]
+            wheel = names.index(actuator_names[0]) - ROOT
+            fixed[:, wheel, :9] = [(axes @ turned_to(direction)).ravel("F") for direction in after]
             a = row_products(after, axes.T)
             b = axes @ before
             change = np.outer(b, b) - a[:, :, None] * a[:, None]
             row, column = np.triu_indices(3)
             bodies[:, body, 4:] += item.inertia * change[:, row, column]
-    of = {"wrench": wrench, "stored": stored, "fixed": fixed, "bodies": bodies}
-    return {name: each.reshape(count, -1) for name, each in of.items()}
+    arrays = {"wrench": wrench, "stored": stored, "fixed": fixed, "bodies": bodies}
+    return {name: values.reshape(count, -1) for name, values in arrays.items()}
 
 
 def _pointed(item: Thruster | ReactionWheel, along: Array) -> Thruster | ReactionWheel:

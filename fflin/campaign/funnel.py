@@ -54,8 +54,8 @@ def ellipsoid_axes(P: Array) -> Array:
     values, axes = np.linalg.eigh(unit[:, None] * P * unit)
     kept = values > _ROUNDING * values.max()
     root = axes[:, kept] / np.sqrt(values[kept]) @ axes[:, kept].T
-    found: Array = unit[:, None] * root
-    return found
+    W: Array = unit[:, None] * root
+    return W
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -237,7 +237,8 @@ class Funnel(Design):
         count = self.outcomes.shape[1]
         sure = f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: initial errors from which every run ends with {self.goal}"
-        head += f", and with {self.within} at all times" * bool(self.within)
+        if self.within:
+            head += f", and with {self.within} at all times"
         head += f"; {count} runs per knot"
         tail = [
             "base, joint: largest half-axes of the ellipsoid of initial errors",
@@ -251,8 +252,10 @@ class Funnel(Design):
         rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
         wide = (self.attitude, self.position, self.joints)
         for k, (low, high) in enumerate(100.0 * self.rate):
-            reach = [f"{each[k].max(initial=0.0):.3g}" for each in wide]
-            many = f"{self.inside[k]}{' +' if self.inside[k] == count else ''}"
+            reach = [f"{half_axes[k].max(initial=0.0):.3g}" for half_axes in wide]
+            many = f"{self.inside[k]}"
+            if self.inside[k] == count:
+                many += " +"
             shares = [f"{100.0 * self.inside_rate[k]:.1f} %", f"{low:.0f}-{high:.0f} %"]
             rows.append([f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares])
         return "\n".join([folded([head]), "", grid(rows, "r"), "", folded(tail)])
@@ -359,19 +362,24 @@ def funnel(
     samples = validation.count("samples", samples)
     seed = validation.whole("seed", seed, 0)
     confidence = validation.share("confidence", confidence)
-    by_level = not isinstance(goal, Mapping)
-    final = _bounds("goal", {"level": goal} if by_level else goal, ["level"] if by_level else KINDS)
-    limits = _bounds("within", {} if within is None else within, KINDS)
+    if isinstance(goal, Mapping):
+        final = _bounds("goal", goal, KINDS)
+        shown_goal = _shown(final)
+    else:
+        final = _bounds("goal", {"level": goal}, ["level"])
+        shown_goal = f"e' P e up to {final['level']:g}"
+    within = {} if within is None else within
+    limits = _bounds("within", within, KINDS)
     how = Execution(executor, workers, threads, None, progress)
-    motion, by = feedback.trajectory, feedback.schedule
-    reached = partial(_outcomes, final, limits, by.P[-1])
-    indices = _indices(motion, by, knots)
+    motion, gains = feedback.trajectory, feedback.schedule
+    reached = partial(_outcomes, final, limits, gains.P[-1])
+    indices = _indices(motion, gains, knots)
     jobs = [runs_from(robot, feedback, pair, engine, options, reached) for pair in indices]
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
     with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            tried[knot], outcomes[knot] = _tested(job, by.P[first], samples, rng, how)
+            tried[knot], outcomes[knot] = _tested(job, gains.P[first], samples, rng, how)
             if how.progress:
                 how.progress(knot + 1, len(jobs))
     return Funnel._of(
@@ -380,11 +388,11 @@ def funnel(
         t=np.array([motion.t[k] for k, _ in indices]),
         tried=tried,
         outcomes=outcomes,
-        goal=f"e' P e up to {final['level']:g}" if by_level else _shown(final),
+        goal=shown_goal,
         within=_shown(limits),
         confidence=confidence,
-        at=by.t - by.t[0] + motion.t[0],
-        P=by.P,
+        at=gains.t - gains.t[0] + motion.t[0],
+        P=gains.P,
         knots=motion.t,
     )
 
@@ -446,7 +454,8 @@ def _tested(
                 break
             root /= 2.0
         further = root < widest and not simulate(np.full(_PILOTS, 1.4 * root)).any()
-        root = min(root * (2.0 if further else 1.4), widest)
+        growth = 2.0 if further else 1.4
+        root = min(root * growth, widest)
     return root**2, simulate(root * (np.arange(samples) + 0.5) / samples)
 
 
@@ -491,12 +500,14 @@ def _shown(bounds: Mapping[str, float]) -> str:
 
 
 def _indices(
-    motion: Trajectory, by: GainSchedule, knots: int | Sequence[float]
+    motion: Trajectory, schedule: GainSchedule, knots: int | Sequence[float]
 ) -> list[tuple[int, int]]:
     """Return (index in the trajectory, index in the schedule) of each chosen knot."""
-    t, own = motion.t - motion.t[0], by.t - by.t[0]
-    at = own.searchsorted(t - 1e-6 * (by.dt or t[-1])).clip(max=len(own) - 1)
-    both = np.flatnonzero(np.abs(own[at] - t) <= 1e-6 * (by.dt or t[-1]))
+    t, schedule_times = motion.t - motion.t[0], schedule.t - schedule.t[0]
+    at = schedule_times.searchsorted(t - 1e-6 * (schedule.dt or t[-1])).clip(
+        max=len(schedule_times) - 1
+    )
+    both = np.flatnonzero(np.abs(schedule_times[at] - t) <= 1e-6 * (schedule.dt or t[-1]))
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError(

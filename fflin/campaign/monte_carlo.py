@@ -33,7 +33,7 @@ from fflin.simulation.report import pushed
 # chunk size must divide _STAGE, so that the number of runs does not depend on the chunk size.
 _STAGE, _GROWTH = 256, 1.25
 
-_OPTIONS = {each.name for each in fields(SimulationOptions)} - {
+_OPTIONS = {option.name for option in fields(SimulationOptions)} - {
     *("robot", "policy", "duration", "events", "callback", "linear", "every", "progress", "engine")
 }
 
@@ -275,7 +275,7 @@ def _computed(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     for start in range(done, runs, store.chunk):
         stop = min(start + store.chunk, runs)
-        unused = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+        unused = {key: np.full((stop - start, *shape), NOT_RUN) for key, shape in shapes.items()}
         store.write(start, stop, unused)
     return resumed
 
@@ -288,14 +288,16 @@ def _is_narrow(
     arrays: dict[str, Array],
 ) -> bool:
     """Return whether the confidence interval of a condition is at most `width` wide."""
-    found = Campaign.of(arrays, header).fraction(until, confidence=confidence)
-    return found.high - found.low <= width
+    interval = Campaign.of(arrays, header).fraction(until, confidence=confidence)
+    return interval.high - interval.low <= width
 
 
 def _chunk(runs: int, given: int | None, workers: int, *, staged: bool) -> int:
     """Return the number of runs per chunk; if `staged` is true, it must divide _STAGE."""
     if given is None:
-        return chunk_size(min(_STAGE, runs) if staged else runs, workers)
+        if staged:
+            runs = min(_STAGE, runs)
+        return chunk_size(runs, workers)
     size = -(-given // LANES) * LANES
     if staged and _STAGE % size:
         raise InputError(
@@ -320,10 +322,9 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
     Each goal is evaluated on the empty campaign `none`, so that an invalid goal raises an error.
     """
     listed = [given] if isinstance(given, str) else given
-    goals: list[str] = [
-        *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']"),
-        *([] if until is None else [until]),
-    ]
+    goals: list[str] = [*instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']")]
+    if until is not None:
+        goals.append(until)
     for goal in goals:
         none.met(instance("a goal", goal, str, "a text such as 'attitude < 1 deg'"))
     return tuple(dict.fromkeys(goals))
@@ -355,6 +356,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
     for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
         if fed_back[part][job.kinds[part] == number].any():
             judged.append(kind)
+    x_end = job.target if job.target.ndim == 1 else job.target[-1]
     if "position" in judged and not pushed(plant.actuation):
         judged.remove("position")
     return {
@@ -375,7 +377,7 @@ def _header(job: CampaignJob) -> dict[str, object]:
         "input_limits": np.fmax(-plan.limits.low, plan.limits.high).tolist(),
         "wheels": [name for name in robot.joint_names if name in plan.flown],
         "modes": [joint.name for joint in robot.modes],
-        "x_end": (job.target if job.target.ndim == 1 else job.target[-1]).tolist(),
+        "x_end": x_end.tolist(),
         "replay_settings": replay_settings(job.given, job.options),
     }
 

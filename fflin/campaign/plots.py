@@ -78,12 +78,15 @@ def plot_campaign(
     top = whole("worst", worst, 0, len(_WORST))
     runs = campaign.worst(top) if top else []
     groups = dict[str, list[int]]()
-    for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
-        groups.setdefault(group_of(key), []).append(at)
     kinds = campaign.judged or ("attitude",)
-    rows: list[Any] = [[(_error, kind, runs) for kind in kinds]] * bool(campaign.times)
+    rows: list[Any] = []
+    if campaign.times:
+        for index, key in enumerate(input_keys(campaign)):
+            groups.setdefault(group_of(key), []).append(index)
+        rows.append([(_error, kind, runs) for kind in kinds])
     rows.append([(_histogram, kind) for kind in kinds])
-    last = [*((_inputs, *each, runs) for each in groups.items()), (_correlations,)]
+    last: list[Any] = [(_inputs, group, indices, runs) for group, indices in groups.items()]
+    last.append((_correlations,))
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
     with drawing(path, 11.0, 0.8 + 2.6 * len(rows), axes=axes) as figure:
@@ -220,14 +223,14 @@ def plot_funnel(
 
 
 def _bands(
-    axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
+    axes: Axes, campaign: Campaign, values: Array, runs: list[int], selected: Any = slice(None)
 ) -> None:
-    """Draw values (N, M) over time: lines of `runs`, and bands and median of the runs in `of`."""
+    """Draw values (N, M) over time: lines of `runs`, bands and median of the `selected` runs."""
     # The bands and the median show infinite values of stopped runs at the upper edge of the axes.
     # The quantiles are not interpolated between runs, because a mean of a finite value and the edge
     # has no meaning.
     most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
-    shown = np.minimum(values[of], most)
+    shown = np.minimum(values[selected], most)
     t = campaign.times
     for tail, name, dark in _BANDS:
         low, high = np.quantile(shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf")
@@ -265,17 +268,17 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
     The histograms include only the completed runs. The percentiles include all runs.
     """
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
-    of = {name: campaign.values(name)[~campaign.stopped] for name in names}
-    values = np.append(list(of.values()), 0.0)
+    values_of = {name: campaign.values(name)[~campaign.stopped] for name in names}
+    values = np.append(list(values_of.values()), 0.0)
     most = float(values.max()) or 1.0
     least = max(float(values[values > 0.0].min(initial=most)), most * 10.0**-_DECADES)
     edges = np.linspace(0.0, 1.02 * most, _BINS)
     if least < 0.05 * most:
         edges = np.geomspace(0.8 * least, 1.3 * most, _BINS)
         axes.set_xscale("log")
-    for name, (said, color) in names.items():
+    for name, (label, color) in names.items():
         kept: Any = edges
-        axes.hist(of[name].clip(*edges[[0, -1]]), kept, color=color, alpha=0.55, label=said)
+        axes.hist(values_of[name].clip(*edges[[0, -1]]), kept, color=color, alpha=0.55, label=label)
         for p, mark, style in _PERCENTILES:
             at = campaign.quantile(name, p).value
             if math.isfinite(at):
@@ -307,11 +310,11 @@ def _correlations(axes: Axes, campaign: Campaign) -> None:
 
     A grey area marks correlations that are not significant.
     """
-    found = list(campaign.sensitivity().items())[:_BARS][::-1]
+    bars = list(campaign.sensitivity().items())[:_BARS][::-1]
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)
-    colors = [_INK if size > 0.0 else COLORS[1] for _, size in found]
-    axes.barh([name for name, _ in found], [size for _, size in found], color=colors, height=0.7)
+    colors = [_INK if size > 0.0 else COLORS[1] for _, size in bars]
+    axes.barh([name for name, _ in bars], [size for _, size in bars], color=colors, height=0.7)
     axes.axvline(0.0, color="#333333", lw=0.8)
     axes.set(title=f"correlation with {campaign.about}")
     axes.set(xlabel="rank correlation (grey: not significant)")

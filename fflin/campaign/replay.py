@@ -46,11 +46,11 @@ def replay_settings(dispersions: object, options: Mapping[str, object]) -> dict[
 def _plain(value: object) -> object:
     """Convert arrays and NumPy numbers, also inside mappings and sequences, to JSON values."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_plain(entry) for entry in value]
     return value
 
 
@@ -61,11 +61,11 @@ def job_of(
 
     `options` are the options of the original call that the file does not contain.
     """
-    own = instance("robot", robot, Robot, "the fflin.Robot of the campaign")
-    if own.urdf_sha256 != campaign.urdf_sha256:
+    checked_robot = instance("robot", robot, Robot, "the fflin.Robot of the campaign")
+    if checked_robot.urdf_sha256 != campaign.urdf_sha256:
         raise InputError(
-            f"robot is '{own.name}', but the campaign is of another URDF, '{campaign.robot}'; give "
-            "the robot of the campaign"
+            f"robot is '{checked_robot.name}', but the campaign is of another URDF, "
+            f"'{campaign.robot}'; give the robot of the campaign"
         )
     settings: Mapping[str, Any] = campaign.replay_settings
     if not settings:
@@ -85,7 +85,7 @@ def job_of(
     placement = again.get("reference")
     if isinstance(placement, Mapping):
         again["reference"] = pin.SE3(np.array(placement["placement"]))
-    job = CampaignJob(own, policy, spreads, campaign.seed, campaign.engine, again)
+    job = CampaignJob(checked_robot, policy, spreads, campaign.seed, campaign.engine, again)
     if job.dispersions.names != campaign.names or job.plant.state.names != campaign.state_names:
         raise InputError(
             "the robot or policy is not that of the campaign, because the names of the drawn "

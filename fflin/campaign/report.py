@@ -20,10 +20,13 @@ def campaign_report(campaign: Campaign) -> str:
     """Return the report with success rates of goals, error quantiles and rank correlations."""
     count = len(campaign)
     quantile = campaign.quantile
-    by = ", compiled" if campaign.engine == "compiled" else ""
-    few = f" of {campaign.asked:,} requested" if count < campaign.asked else ""
-    title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
-    title += f" in steps of {campaign.dt:.3g} s"
+    title = f"{campaign.robot}: {count:,} runs"
+    if count < campaign.asked:
+        title += f" of {campaign.asked:,} requested"
+    title += f", {campaign.duration:g} s each in steps of {campaign.dt:.3g} s"
+    title += f", seed {campaign.seed}"
+    if campaign.engine == "compiled":
+        title += ", compiled"
     rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
     for name, unit in _errors(campaign).items():
         figures = [quantile(name, p).value for p in _SHARES]
@@ -33,15 +36,15 @@ def campaign_report(campaign: Campaign) -> str:
             when = _when(quantile(f"settle {name}", 0.95).value, " s")
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
     causes: dict[str, list[str]] = {}
-    for name, found in influences(campaign).items():
-        first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
+    for name, influence in influences(campaign).items():
+        first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(influence.items())[:4])
         causes.setdefault(first or "none significant", []).append(name)
     correlations = [
         f"rank correlations with {', '.join(names)}: {first}" for first, names in causes.items()
     ]
     goals = [goal_met(campaign, goal) for goal in campaign.goals]
     ended = ended_of(campaign)
-    head = folded([*goals, ended, f"{title}, seed {campaign.seed}{by}", *campaign.notes])
+    head = folded([*goals, ended, title, *campaign.notes])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
 
 
@@ -61,8 +64,8 @@ def _errors(campaign: Campaign) -> dict[str, str]:
 
 def ended_of(campaign: Campaign) -> str:
     """Format the number of completed runs, and the number of stopped runs for each reason."""
-    said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
-    return f"{int((campaign.stop == 0.0).sum()):,} completed; {said or 'none stopped early'}"
+    stops = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
+    return f"{int((campaign.stop == 0.0).sum()):,} completed; {stops or 'none stopped early'}"
 
 
 def goal_met(campaign: Campaign, goal: str) -> str:
@@ -101,16 +104,22 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
     for run in campaign.worst(k):
         far = int(out[run].argmax())
         stop = STOPS[int(campaign.stop[run])]
-        ended = f"{campaign.end[run]:g}{', ' * bool(stop)}{stop}"
+        ended = f"{campaign.end[run]:g}"
+        if stop:
+            ended += f", {stop}"
         settled = _when(campaign.values("settle")[run])
-        drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}" if out[run, far] else "-"
+        drawn = "-"
+        if out[run, far]:
+            drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}"
         rows.append([str(run), f"{values[run]:.3g}", unit, settled, ended, drawn])
     return ["", grid(rows, "rrlrll"), ""]
 
 
 def _when(time: float, unit: str = "") -> str:
     """Format a settling time as in the report of a motion."""
-    return f"{time:.3g}{unit}" if math.isfinite(time) else "not yet"
+    if not math.isfinite(time):
+        return "not yet"
+    return f"{time:.3g}{unit}"
 
 
 def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
@@ -122,7 +131,7 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
     def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]
 
-    names = [f"{of}{kind}" for kind in KINDS for of in ("", "worst ", "settle ")]
+    names = [f"{prefix}{kind}" for kind in KINDS for prefix in ("", "worst ", "settle ")]
     sure = {"confidence": campaign.confidence}
     header = [
         "robot",

@@ -71,9 +71,10 @@ _FORMER = {"turning": "omega_b", "moving": "v_b", "rates": "joint rates"}
 
 def kind_named(name: str) -> str:
     """Replace a former name of a kind of error, as in ``worst turning``, by its present name."""
-    of, _, kind = name.rpartition(" ")
-    kind = _FORMER.get(kind, kind) if of in ("", "worst", "settle") else kind
-    return f"{of} {kind}".strip()
+    statistic, _, kind = name.rpartition(" ")
+    if statistic in ("", "worst", "settle"):
+        kind = _FORMER.get(kind, kind)
+    return f"{statistic} {kind}".strip()
 
 
 # Function that returns {name: result (N, ..)} from the outcomes of N runs; see
@@ -83,9 +84,9 @@ Judge: TypeAlias = Callable[[Mapping[str, Array]], dict[str, Array]]
 
 def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
     """Return the arrays of `outcomes` that a `Campaign` contains: all except `state_errors`."""
-    found = dict(outcomes)
-    del found["state_errors"]
-    return found
+    arrays = dict(outcomes)
+    del arrays["state_errors"]
+    return arrays
 
 
 def kinds_of(state: StateMap, wheels: Collection[str]) -> Indices:
@@ -102,7 +103,8 @@ def kinds_of(state: StateMap, wheels: Collection[str]) -> Indices:
     kind[groups.qdot_m] = len(KINDS) - 1
     for index, joint in enumerate(state.robot.joints):
         if joint in modes or joint.name in wheels:
-            kind[groups.q_m.start + index] = 0 if joint in modes else -1
+            kind_of_position = 0 if joint in modes else -1
+            kind[groups.q_m.start + index] = kind_of_position
             kind[groups.qdot_m.start + index] = 0
     return kind
 
@@ -198,36 +200,36 @@ class CampaignJob:
             return content_digest(completed(self, first, Execution()))
         plan = self.plan
         arguments = lanes.packed(self.plan, stop_conditions(self.plan))
-        found: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
+        entries: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
         if plan.noise:
             last = min(plan.times.steps, lanes.SLOTS * plan.times.sample)
-            found["of sensors"] = lanes.noises(plan, len(arguments.law.y), 0, last)[1]
+            entries["of sensors"] = lanes.noises(plan, len(arguments.law.y), 0, last)[1]
         left: list[object] = [arguments]
         while left:  # the arrays and numbers in nested tuples
             value = left.pop()
             if isinstance(value, tuple):
                 left.extend(value)
             else:
-                found[f"loop.{len(found)}"] = value
-        return content_digest(found)
+                entries[f"loop.{len(entries)}"] = value
+        return content_digest(entries)
 
     def run(self, rows: Rows, start: int, out: Mapping[str, Array]) -> list[str]:
         """Simulate runs with the given drawn values; see `Job`."""
         drawn = rows["drawn"]
-        found = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
+        outcomes = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
             eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
             for first in range(0, len(drawn), LANES):
                 part = slice(first, first + LANES)
-                eight = {key: each[part] for key, each in runs.items()}
-                eight_runs.fly(statistics, {key: x[part] for key, x in found.items()}, eight)
+                eight = {key: values[part] for key, values in runs.items()}
+                eight_runs.fly(statistics, {key: x[part] for key, x in outcomes.items()}, eight)
         else:
-            for row, own in enumerate(drawn):
-                outcome = self._one(own)
-                for key, values in found.items():
+            for row, drawn_row in enumerate(drawn):
+                outcome = self._one(drawn_row)
+                for key, values in outcomes.items():
                     values[row] = outcome[key]
-        for key, values in self.judge(found).items():
+        for key, values in self.judge(outcomes).items():
             out[key][:] = values
         return []
 
@@ -264,9 +266,9 @@ class CampaignJob:
         kept = steps[steps < count]
 
         def history(values: Array, after: float) -> Array:
-            found = np.full((len(steps), values.shape[1]), after)
-            found[: len(kept)] = values[kept]
-            return found
+            entries = np.full((len(steps), values.shape[1]), after)
+            entries[: len(kept)] = values[kept]
+            return entries
 
         return dict(
             q=run.q[-1],
@@ -314,13 +316,15 @@ class CampaignJob:
         times = list[float]()
         steps = plan.times.steps
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
-        short, long = (min(each, steps) for each in (_FEW_STEPS, _SOME_STEPS))
-        for each in (1, short, long):  # the run of one step compiles the loop if needed
-            few.plan = plan.replace(times=plan.times._replace(steps=each))
+        short, long = (min(trial, steps) for trial in (_FEW_STEPS, _SOME_STEPS))
+        for trial_steps in (1, short, long):  # the run of one step compiles the loop if needed
+            few.plan = plan.replace(times=plan.times._replace(steps=trial_steps))
             # Other programs can slow down a trial, so the fastest of three trials counts.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
             times.append(min(repeat(timed, timer=perf_counter, repeat=3, number=1)))
-        step = (times[2] - times[1]) / (long - short) if long > short else 0.0
+        step = 0.0
+        if long > short:
+            step = (times[2] - times[1]) / (long - short)
         return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
@@ -386,7 +390,9 @@ class RunStatistics(lanes.Statistics):
         """Return a mask (LANES,) of the runs that `CampaignJob.over` ends, judged by q and v."""
         over = self._job.over
         first = _by_run(self._marks.states[: self._state.nx])
-        return over(first, self._job.errors(q, v)[1]) if over else np.zeros(LANES, dtype=bool)
+        if not over:
+            return np.zeros(LANES, dtype=bool)
+        return over(first, self._job.errors(q, v)[1])
 
     def add(self, first: int, rows: Array) -> None:
         """Add consecutive steps to the statistics; the first of them has the index `first`.

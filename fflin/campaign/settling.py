@@ -93,17 +93,20 @@ class Loop:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
         names, full = self.lin.state_names, self.state.names
-        of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
-        # Q contains the weights of velocities and coordinates. `of` is {velocity: square root of
-        # its weight}, and the weight is a diagonal entry of M. `size` contains the square root of
-        # the weight of each coordinate: the root for its velocity times the decay rate of the loop.
-        # Coordinates and velocities are matched by name, because a velocity can be a state of the
-        # model even if its coordinate is not.
+        root_of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
+        # Q contains the weights of velocities and coordinates. `root_of` is {velocity: square root
+        # of its weight}, and the weight is a diagonal entry of M. `size` contains the square root
+        # of the weight of each coordinate: the root for its velocity times the decay rate of the
+        # loop. Coordinates and velocities are matched by name, because a velocity can be a state of
+        # the model even if its coordinate is not.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
-        size = [self.decay * of[rates[name]] for name in names if name not in of]
-        Q = np.diag(np.array([*size, *of.values()]) ** 2)
-        solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
-        P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)
+        size = [self.decay * root_of[rates[name]] for name in names if name not in root_of]
+        Q = np.diag(np.array([*size, *root_of.values()]) ** 2)
+        P: Array
+        if self.lin.dt:
+            P = solve_discrete_lyapunov(self.rate.T, Q)
+        else:
+            P = solve_continuous_lyapunov(self.rate.T, -Q)
         return (P + P.T) / 2.0
 
     def size(self, error: Array) -> Array:
@@ -121,7 +124,7 @@ class Loop:
         """
         g = self.state.groups
         x = self.start.copy()
-        axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+        axis, along = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
         relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
@@ -151,12 +154,13 @@ class Loop:
         # decay rate of the closed loop is also taken into account, by the term 4 * decay in `pace`.
         free = linearize(self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
         rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
-        fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
-        horizon = (_CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)) / decay
+        fastest = max(float(np.abs(np.linalg.eigvals(matrix)).max()) for matrix in rates)
+        time_constants = _CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)
+        horizon = time_constants / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
         # The step must also be short enough for the damping of all modes.
         matrices = [free.A] if lin.dt else [free.A, self.rate]
-        poles = [Poles("robot and the loop", np.linalg.eigvals(each)) for each in matrices]
+        poles = [Poles("robot and the loop", np.linalg.eigvals(matrix)) for matrix in matrices]
         step = _STEP_PREDICTED if predicts else _STEP
         dt, _ = Pace(poles, CommutatorFree4, horizon).step(step / pace)
         every = 1
@@ -179,8 +183,13 @@ class Loop:
         options |= {"limits": limits, "unlimited": limits is None, "project": not predicts}
         # The linear loop predicts rotations of less than 180 deg only.
         options |= {"within_chart": True}
-        options |= {"histories": checks + 1 if predicts else 1}
-        judge = partial(self._judged, self._transition(dt, every) if predicts else None)
+        histories = 1
+        transition = None
+        if predicts:
+            histories = checks + 1
+            transition = self._transition(dt, every)
+        options |= {"histories": histories}
+        judge = partial(self._judged, transition)
         over = None if predicts else self._is_over
         policy = StateFeedback(lin, self.K)
         return CampaignJob(self.robot, policy, None, 0, engine, options, judge, over)
@@ -199,7 +208,7 @@ class Loop:
 
         `first` (N, nx) are the initial state errors, and `e` (N, nx) the present state errors.
         """
-        first, size = (self.size(each[:, self.model_states]) for each in (first, e))
+        first, size = (self.size(states[:, self.model_states]) for states in (first, e))
         over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
         return over
 
@@ -237,10 +246,11 @@ def settle(
     """
     arrays, left = dict[str, Array](), np.arange(len(starts))
     for fine in range(_FINEST + 1):
-        found = completed(runs_of(fine=fine), starts[left], how, None if fine else progress)
-        for key, values in found.items():
+        shown_progress = None if fine else progress
+        results = completed(runs_of(fine=fine), starts[left], how, shown_progress)
+        for key, values in results.items():
             arrays.setdefault(key, values)[left] = values
-        left = left[found["outcome"] == OUTCOMES.index("diverged")]
+        left = left[results["outcome"] == OUTCOMES.index("diverged")]
         if not len(left):
             break
     return arrays

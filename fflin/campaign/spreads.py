@@ -86,8 +86,10 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
     try:
         document = TomlFile(as_path(path))
     except InputError as error:  # for example, q_b = 1 and q_b.sensor = 1
-        hint = '; put names that contain dots in quotes, "q_b.sensor"' * ("overwrite" in str(error))
-        raise InputError(f"{error}{hint}") from None
+        message = str(error)
+        if "overwrite" in message:
+            message += '; put names that contain dots in quotes, "q_b.sensor"'
+        raise InputError(message) from None
     table = document.record.get(_TABLE)
     for key in (*document.record, _TABLE):
         if key != _TABLE or not isinstance(table, dict) or not table:
@@ -97,14 +99,14 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
                 problem = f"{kind} '{key}' is outside [{_TABLE}], the only table of this file"
             problem = f"{problem}; write [{_TABLE}] and below it q_b = 0.05"
             raise document.error(UnknownNameError(problem), key)
-    found = DispersionFile()
-    found.document = document
+    dispersions = DispersionFile()
+    dispersions.document = document
     for name, value in _names(table or {}):
         try:
-            found[name] = _spread(value)
+            dispersions[name] = _spread(value)
         except FflinError as error:
             raise document.error(type(error)(f"'{name}': {error}"), _TABLE, name) from None
-    return found
+    return dispersions
 
 
 def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
@@ -127,10 +129,14 @@ def _spread(value: object) -> object:
     if isinstance(name := table.get("distribution"), str):
         return _distribution(name, {k: x for k, x in table.items() if k != "distribution"})
     (form, given), *others = table.items() or [("", None)]
-    entries = given if isinstance(given, list) and form in ("uniform", "values") else [given]
+    entries = [given]
+    if isinstance(given, list) and form in ("uniform", "values"):
+        entries = given
     right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
     if not others and all(map(is_number, entries)) and right.get(form):
-        return tuple(entries) if form == "uniform" else given
+        if form == "uniform":
+            return tuple(entries)
+        return given
     raise InputError(f"{reprlib.repr(value)} is not a dispersion, expected {_EXPECTED}")
 
 
@@ -144,7 +150,7 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
     from scipy import stats
 
     kinds = stats.rv_continuous, stats.rv_discrete
-    known = [each for each in dir(stats) if isinstance(getattr(stats, each), kinds)]
+    known = [name for name in dir(stats) if isinstance(getattr(stats, name), kinds)]
     if distribution not in known:
         raise unknown("distribution of scipy.stats", distribution, known)
     kind = getattr(stats, distribution)
@@ -187,21 +193,23 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
         inverse: Inverse = spread.ppf
         return inverse
     if isinstance(spread, tuple):
-        bounds = [number(f"'{name}'", each) for each in spread]
+        bounds = [number(f"'{name}'", entry) for entry in spread]
         if len(bounds) != 2 or bounds[0] > bounds[1]:
             raise InputError(
                 f"'{name}' is {spread!r}, expected bounds (least, largest) with least <= largest"
             )
         return partial(_uniform, bounds[0], bounds[1])
     if isinstance(spread, list | np.ndarray):
-        values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
+        values = [number(f"'{name}'", entry) for entry in np.ravel(spread).tolist()]
         if not values:
             raise InputError(f"the list of values of '{name}' is empty; give at least one value")
         return partial(_choice, np.array(values))
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:
         raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of at least 0")
-    return partial(_choice, np.array([deviation])) if fixed else partial(_normal, deviation)
+    if fixed:
+        return partial(_choice, np.array([deviation]))
+    return partial(_normal, deviation)
 
 
 def _uniform(least: float, largest: float, u: Array) -> Array:

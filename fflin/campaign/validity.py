@@ -109,7 +109,8 @@ class Validity(FrozenArrays):
 
     def __str__(self) -> str:
         trusted, holds, largest = (
-            shown(each, self.joint_unit) for each in (self.trusted, self.holds, self.largest)
+            shown(displacement, self.joint_unit)
+            for displacement in (self.trusted, self.holds, self.largest)
         )
         count = len(self.outcomes)
         sure = f"{100.0 * self.confidence:g} %"
@@ -121,18 +122,23 @@ class Validity(FrozenArrays):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
         beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
-        lines = [
+        prediction = (
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
-            f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
-            f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
-            f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
-            if self.inside
-            else f"the run from the smallest displacement tried, {first}, did not settle",
+            f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}"
+        )
+        safe = f"the run from the smallest displacement tried, {first}, did not settle"
+        if self.inside:
+            safe = (
+                f"up to {holds}, every run settled ({self.inside} of {self.inside}), so at least "
+                f"{100.0 * self.inside_rate:.1f} % of such displacements settle ({sure} confidence)"
+            )
+        overall = (
             f"up to {largest}, {self.settled} of {count} runs settled, so {100.0 * low:.1f} to "
             f"{100.0 * high:.1f} % of such displacements settle ({sure} confidence)"
-            + (f"; {failures}" if failures else ""),
-        ]
-        return folded(lines)
+        )
+        if failures:
+            overall += f"; {failures}"
+        return folded([prediction, safe, overall])
 
 
 _ENDS = {
@@ -257,14 +263,15 @@ def validity(
         # So all random runs take about as long as `few` runs of the largest duration.
         few = math.ceil(samples / PATIENCE)
         expect(how.progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
-        told = how.progress and partial(_report, how.progress, 0, total)
-        predicted = settle(predicting, first, how, told)
-        told = how.progress and partial(_report, how.progress, len(first), total)
-        random = settle(settling, second, how, told)
+        part_progress = how.progress and partial(_report, how.progress, 0, total)
+        predicted = settle(predicting, first, how, part_progress)
+        part_progress = how.progress and partial(_report, how.progress, len(first), total)
+        random = settle(settling, second, how, part_progress)
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
     failed = np.array([outcome != "settled" for outcome in outcomes])
     inside, bound, rate = until_failure(failed, confidence)
+    safe_level = float(levels[inside - 1]) if inside else 0.0
     return Validity(
         levels=_LEVELS,
         prediction_error=error,
@@ -272,7 +279,7 @@ def validity(
         trusted=_scaled(largest, _crossing(error)),
         sampled=levels,
         outcomes=outcomes,
-        holds=_scaled(largest, float(levels[inside - 1]) if inside else 0.0),
+        holds=_scaled(largest, safe_level),
         inside=inside,
         inside_rate=bound,
         rate=rate,
@@ -315,7 +322,9 @@ def _crossing(errors: Array) -> float:
         # assumed to be proportional to the level. If errors[0] is NaN, the result is 0.
         at = max(first - 1, 0)
         near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
-        return near if np.isfinite(errors[0]) else 0.0
+        if not np.isfinite(errors[0]):
+            return 0.0
+        return near
     pair = slice(first - 1, first + 1)
     return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
 
@@ -338,7 +347,9 @@ def _checked_displacement(
         )
     groups = {name.partition(".")[0] for name in lin.state_names}
     names = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
-    largest = {key: given[key] if name in groups else 0.0 for key, name in names.items()}
+    largest = {}
+    for key, name in names.items():
+        largest[key] = given[key] if name in groups else 0.0
     if not any(largest.values()):
         raise InputError(
             "no state of the model is displaced; give a nonzero displacement of one of its states"
@@ -354,8 +365,10 @@ def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
 def joint_unit(lin: LinearModel) -> str:
     """Return the unit that all joints of the model share, or "rad|m" if there is no such unit."""
     pairs = zip(lin.state_names, lin.state_units, strict=True)
-    of = {unit for name, unit in pairs if name.startswith("q_m.")}
-    return of.pop() if len(of) == 1 else "rad|m"
+    units = {unit for name, unit in pairs if name.startswith("q_m.")}
+    if len(units) == 1:
+        return units.pop()
+    return "rad|m"
 
 
 def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:

@@ -71,7 +71,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         given["orbit"] = None
     # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
     # settings in `given` are applied after loading.
-    first = {"passive": given.pop("passive")} if "passive" in given else {}
+    first: dict[str, Any] = {}
+    if "passive" in given:
+        first["passive"] = given.pop("passive")
     if given.get("damping") == [(None, "urdf")]:
         first["damping"] = "urdf"
     robot = fflin.load(
@@ -80,7 +82,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         xacro=once("--xacro", arguments.xacro),
         **first,
     )
-    for name in [each for each in ("stiffness", "damping") if each in given]:
+    for name in ("stiffness", "damping"):
+        if name not in given:
+            continue
         for_all = [value for joint, value in given[name] if joint is None]
         if for_all and len(given[name]) > 1:
             raise InputError(
@@ -95,9 +99,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             "joints": (fflin.JointTorque("*"),),
             "base": (fflin.BaseTorque(), fflin.BaseForce()),
         }
-        found = bundled.get(inputs) or fflin.load_inputs(inputs)
+        new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
         with located(inputs):  # errors about a name or an inertia show the file
-            robot = robot.replace(inputs=found)
+            robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs
     return robot.merged(given)
@@ -108,7 +112,9 @@ def limits_of_options(
 ) -> list[str | dict[str, float]] | dict[str, float] | None:
     """Return the limits that the options --limits and --limit define."""
     given = once("--limit", arguments.limit)
-    return ["urdf", given] if arguments.limits == "urdf" else given or None
+    if arguments.limits == "urdf":
+        return ["urdf", given]
+    return given or None
 
 
 def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
@@ -151,7 +157,10 @@ def state_of(
     given["velocity"] = rates_by_name(names, rates)
     state = reduce(combined, (*states, given))
     q = fflin.configuration(robot, state["joints"], base_of(state))
-    return q, fflin.velocity(robot, state["velocity"]) if state["velocity"] else None
+    v = None
+    if state["velocity"]:
+        v = fflin.velocity(robot, state["velocity"])
+    return q, v
 
 
 def point_of(
@@ -178,7 +187,9 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     """Return the reference of --reference; None means the base pose at the operating point."""
     import pinocchio as pin
 
-    return pin.SE3.Identity() if getattr(arguments, "reference", None) == "world" else None
+    if getattr(arguments, "reference", None) == "world":
+        return pin.SE3.Identity()
+    return None
 
 
 def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
@@ -199,8 +210,8 @@ def model_about(
     given = once("--effort", arguments.effort)
     u = fflin.effort(robot, given) if given else None
     if arguments.relative_equilibrium or arguments.equilibrium:
-        by = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"
-        refuse(arguments, ("effort",), f"{by} already sets the inputs at the operating point")
+        option = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"
+        refuse(arguments, ("effort",), f"{option} already sets the inputs at the operating point")
         held = fflin.equilibrium(robot, q, v=v, **axes)
         q, u = held.q, held.u
     return fflin.linearize(robot, q, v, u, **axes)
@@ -256,7 +267,7 @@ def robot_of_design(
         allocate = of_wrench and thrusters_give_every_wrench(robot)
     if not allocate:
         return robot
-    others = tuple(each for each in robot.inputs if not isinstance(each, fflin.Thruster))
+    others = tuple(item for item in robot.inputs if not isinstance(item, fflin.Thruster))
     if len(others) == len(robot.inputs):
         raise InputError(
             f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
@@ -295,8 +306,10 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
     try:
         return fflin.lqr(lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds)
     except UnknownNameError as error:
-        hint = "; --no-allocate weights single thrusters" * allocated
-        raise UnknownNameError(f"{error}{hint}") from None
+        message = str(error)
+        if allocated:
+            message += "; --no-allocate weights single thrusters"
+        raise UnknownNameError(message) from None
 
 
 def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[fflin.Policy | None, dict[str, Any]]:
@@ -314,7 +327,9 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[fflin.Policy | No
         tracking = along(design, arguments)
         if offset := once("--offset", arguments.offset):
             settings["q0"], settings["v0"] = tracking.beside(offset)
-        return fflin.Allocation(tracking, design) if arguments.allocate else tracking, settings
+        if arguments.allocate:
+            return fflin.Allocation(tracking, design), settings
+        return tracking, settings
     refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
     if arguments.free:
         of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
@@ -390,9 +405,9 @@ def about_point(
 
         settings = {"dt": arguments.sample, "limits": limits_of_options(arguments)}
         weights = weights_of(arguments)
-        by = fflin.mpc(lin, horizon=arguments.horizon, weights=weights, **settings)
-        assert isinstance(by, Mpc)  # since the model is about a point
-        return by, fflin.StateFeedback(by.lin, by.gain.K), None
+        controller = fflin.mpc(lin, horizon=arguments.horizon, weights=weights, **settings)
+        assert isinstance(controller, Mpc)  # since the model is about a point
+        return controller, fflin.StateFeedback(controller.lin, controller.gain.K), None
     if arguments.controller:
         of_gain = (*_WEIGHTS, "gain", "reduce")
         refuse(arguments, of_gain, "--controller replaces the regulator and its options")
@@ -400,10 +415,13 @@ def about_point(
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
         gain = gain or gain_of(lin, arguments, allocated=design is not robot)
-        feedback = fflin.StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+        model = lin.discretize(gain.dt) if gain.dt else lin
+        feedback = fflin.StateFeedback(model, gain.K)
     if design is not robot:
         return fflin.Allocation(feedback, design), feedback, None
-    return feedback, feedback, None if arguments.reduce or arguments.controller else lin
+    if arguments.reduce or arguments.controller:
+        return feedback, feedback, None
+    return feedback, feedback, lin
 
 
 def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:

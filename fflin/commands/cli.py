@@ -71,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     try:
-        main_parser = _parser(argv[0] if argv else "")
+        asked = argv[0] if argv else ""
+        main_parser = _parser(asked)
         arguments, unknown = main_parser.parse_known_args(argv)
         if unknown:  # the error refers to the options of the command
             chosen = getattr(arguments, "command", main_parser)
@@ -134,7 +135,8 @@ def _parser(asked: str) -> parser.Command:
     known = any(asked in names for names in TASKS.values())
     for task, names in TASKS.items():
         group = main.add_argument_group(task)
-        for name in names if not known else {asked} & {*names}:
+        shown = {asked} & {*names} if known else names
+        for name in shown:
             module = "control" if name in _CONTROL.split() else "models"
             parser.add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
         # argparse puts all commands in one group; move them to the group of their task.
@@ -146,7 +148,7 @@ def _parser(asked: str) -> parser.Command:
 def finish(report: Report, arguments: argparse.Namespace) -> int:
     """Write the files of a report, print the report, and return the exit code."""
     command = arguments.command.prog.split()[-1]
-    said = [report.interrupted]
+    messages = [report.interrupted]
     written: list[Path] = []
     # Write the files before the report is printed, so that a closed pipe cannot prevent writing
     # them. If writing a file fails, the report is still printed.
@@ -155,7 +157,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
             if path is None:
                 continue
             if report.interrupted and path.exists():
-                said.append(f"{path} is unchanged")
+                messages.append(f"{path} is unchanged")
                 continue
             if write:
                 write(path)
@@ -177,11 +179,13 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
         else:
             lines = [headed(command, report.text)]
             for path in written:
-                size = f": {path.stat().st_size / 1e6:.2f} MB" if path.suffix in _PAGES else ""
-                lines.append(f"wrote {path}{size}")
+                line = f"wrote {path}"
+                if path.suffix in _PAGES:
+                    line += f": {path.stat().st_size / 1e6:.2f} MB"
+                lines.append(line)
             print("\n".join(lines))
     if report.interrupted:
-        raise KeyboardInterrupt("; ".join(said))
+        raise KeyboardInterrupt("; ".join(messages))
     return report.code
 
 
@@ -205,16 +209,18 @@ def plain(value: object) -> object:
     elif isinstance(value, Design):
         value = record_of(value)
     elif is_dataclass(value):
-        own = {each.name: getattr(value, each.name) for each in fields(value)}
+        entries = {item.name: getattr(value, item.name) for item in fields(value)}
         # Omit linear models that a result contains, because `fflin linearize` prints such models.
-        value = {key: x for key, x in own.items() if not isinstance(x, fflin.LinearModel)}
+        value = {key: x for key, x in entries.items() if not isinstance(x, fflin.LinearModel)}
     elif hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):
         return {str(key): plain(x) for key, x in value.items() if str(key)[0] != "_"}
     if isinstance(value, list | tuple):
         return [plain(x) for x in value]
-    return value if not isinstance(value, float) or math.isfinite(value) else None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
@@ -226,11 +232,11 @@ def require_own_kind(path: Path, kinds: Sequence[str]) -> None:
         followed_path(path)  # refuses a table that is an input file
     if not path.is_file():
         return
-    found = kind_of(path)
-    if found not in kinds and path.stat().st_size:
-        there = f"holds a {found}" if found else "exists and is not a result of fflin"
+    kind = kind_of(path)
+    if kind not in kinds and path.stat().st_size:
+        state = f"holds a {kind}" if kind else "exists and is not a result of fflin"
         raise FileError(
-            f"{path} {there}; without --force, this command replaces only files that contain a "
+            f"{path} {state}; without --force, this command replaces only files that contain a "
             f"{' or '.join(kinds)}. Give another file name, or add --force"
         )
 
@@ -262,4 +268,4 @@ def kind_of(path: Path) -> str:
             kind = text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types of errors
         return ""
-    return kind or next((name for name, of in _ENTRIES.items() if of <= names), "")
+    return kind or next((name for name, required in _ENTRIES.items() if required <= names), "")

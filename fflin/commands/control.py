@@ -84,7 +84,7 @@ def tvlqr(arguments: Namespace) -> Report:
     Qf = once("--qf", arguments.qf) or "steady"
     schedule = fflin.tvlqr(along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments))
     text = str(schedule)
-    if any(isinstance(each, fflin.Thruster) for each in along.robot.inputs):
+    if any(isinstance(item, fflin.Thruster) for item in along.robot.inputs):
         text += f"\n{folded([_NOT_ALLOCATED])}"
     return Report(along.robot.name, schedule, text, {arguments.output_file: schedule.save})
 
@@ -98,11 +98,13 @@ def export(arguments: Namespace) -> Report:
 
     kinds = {kind.__name__: kind for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)}
     with reading(arguments.file, "Gain, GainSchedule or Compensator"):
-        found = text(read_record(arguments.file)[0]["kind"])
-        if found not in kinds:
-            raise ValueError(f"the file contains: {found}")
-    law = kinds[found].load(arguments.file)
-    robot = robot_of_design(fflin.load(arguments.robot), None, law) if arguments.robot else None
+        kind_name = text(read_record(arguments.file)[0]["kind"])
+        if kind_name not in kinds:
+            raise ValueError(f"the file contains: {kind_name}")
+    law = kinds[kind_name].load(arguments.file)
+    robot = None
+    if arguments.robot:
+        robot = robot_of_design(fflin.load(arguments.robot), None, law)
     limits = None if arguments.limits == "none" else arguments.limits
     name, real = arguments.name, arguments.real
     folder = fflin.write_c(
@@ -111,10 +113,10 @@ def export(arguments: Namespace) -> Report:
     test = (
         f"cd '{folder}'\n  cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm\n  ./{name}_test"
     )
-    said = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
+    message = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
     result = {"name": name, "real": real, "folder": str(folder)}
     endings = (".h", ".c", "_test.c", ".json")
-    return Report(law.robot, result, said, {folder / f"{name}{end}": None for end in endings})
+    return Report(law.robot, result, message, {folder / f"{name}{end}": None for end in endings})
 
 
 def plan(arguments: Namespace) -> Report:
@@ -124,7 +126,9 @@ def plan(arguments: Namespace) -> Report:
     """
     robot = load_robot(arguments)
     q0, v0 = state_of(robot, arguments, robot.point, robot.start)
-    guess = fflin.Trajectory.load(arguments.guess, robot) if arguments.guess else None
+    guess = None
+    if arguments.guess:
+        guess = fflin.Trajectory.load(arguments.guess, robot)
     motion = fflin.plan(
         robot,
         point_of(robot, arguments, "target_")[:2],
@@ -164,7 +168,9 @@ def simulate(arguments: Namespace) -> Report:
         **pictures(robot, lambda: motion, arguments),
     }
     code = FELL_SHORT if motion.stopped else DONE
-    interrupted = motion.stopped if motion.stopped.startswith("interrupted") else ""
+    interrupted = ""
+    if motion.stopped.startswith("interrupted"):
+        interrupted = motion.stopped
     text = motion_report(motion)
     return Report(robot.name, motion_record(motion), text, files, code, interrupted)
 
@@ -188,15 +194,15 @@ def montecarlo(arguments: Namespace) -> Report:
     settings.pop("linear", None)  # the runs are not compared with a linear model
     for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
         settings[name] = getattr(arguments, name)
+    settings["histories"] = _ROWS if arguments.plot else 0
+    settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:
         campaign = fflin.monte_carlo(
             robot,
             policy,
             dispersions,
             goals=arguments.goal,
-            histories=_ROWS if arguments.plot else 0,
             progress=progress,
-            out=None if is_table else path,
             overwrite=arguments.force,
             **settings,
         )
@@ -220,30 +226,33 @@ def validity(arguments: Namespace) -> Report:
     example: fflin validity ets_vii --attitude 120 --samples 200 --jobs 2
     """
     robot, design, lin, gain = designed(arguments)
-    cut = arguments.limits == "urdf"
+    model = lin.discretize(arguments.sample) if arguments.sample else lin
+    limits = "urdf" if arguments.limits == "urdf" else None
+    workers = arguments.jobs if arguments.jobs > 1 else None
     with closing(Progress()) as bar:
-        found = fflin.validity(
+        result = fflin.validity(
             design,
-            lin.discretize(arguments.sample) if arguments.sample else lin,
+            model,
             gain,
             attitude=arguments.attitude,
             position=arguments.offset,
             joint=arguments.spread,
             samples=arguments.samples,
             seed=arguments.seed,
-            limits="urdf" if cut else None,
-            workers=arguments.jobs if arguments.jobs > 1 else None,
+            limits=limits,
+            workers=workers,
             progress=bar,
         )
-    text = str(found)
-    if cut or any(name in lin.limits for name in lin.input_names):
-        how = "not saturated; use --limits urdf to saturate them"
-        said = "saturated at the limits of the robot" if cut else how
-        text += f"\n{folded([f'inputs were {said}'])}"
+    text = str(result)
+    if limits or any(name in lin.limits for name in lin.input_names):
+        saturation = "not saturated; use --limits urdf to saturate them"
+        if limits:
+            saturation = "saturated at the limits of the robot"
+        text += f"\n{folded([f'inputs were {saturation}'])}"
     if design is not robot:
         text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
-    files = {arguments.plot: lambda path: fflin.plot_validity(found, path)}
-    return Report(robot.name, found, text, files)
+    files = {arguments.plot: lambda path: fflin.plot_validity(result, path)}
+    return Report(robot.name, result, text, files)
 
 
 def funnel(arguments: Namespace) -> Report:
@@ -256,7 +265,7 @@ def funnel(arguments: Namespace) -> Report:
     robot = load_robot(arguments)
     policy = along(robot, arguments)
     with closing(Progress()) as bar:
-        found = fflin.funnel(
+        result = fflin.funnel(
             robot,
             policy,
             once("--goal", arguments.goal),
@@ -266,10 +275,10 @@ def funnel(arguments: Namespace) -> Report:
             **{name: getattr(arguments, name) for name in _RUNS},
         )
     files = {
-        arguments.plot: lambda path: fflin.plot_funnel(found, path),
-        arguments.output_file: found.save,
+        arguments.plot: lambda path: fflin.plot_funnel(result, path),
+        arguments.output_file: result.save,
     }
-    return Report(robot.name, found, str(found), files)
+    return Report(robot.name, result, str(result), files)
 
 
 def sweep(arguments: Namespace) -> Report:
@@ -286,11 +295,12 @@ def sweep(arguments: Namespace) -> Report:
     linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
-    resuming = f", resuming from {part}" * part.exists()
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
-    said = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}{resuming}"
+    message = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}"
+    if part.exists():
+        message += f", resuming from {part}"
     with going_on(path, "points") as progress:
-        progress.announce(f"fflin: {said}")
+        progress.announce(f"fflin: {message}")
         work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
         batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
@@ -314,7 +324,9 @@ def _points(
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
     q, v = state_of(robot, arguments, robot.point)
-    u = fflin.effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    u = None
+    if arguments.effort:
+        u = fflin.effort(robot, once("--effort", arguments.effort))
     fixed = once("--joint", arguments.joint)
     base = robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
     if arguments.random is not None:
@@ -342,11 +354,13 @@ def going_on(path: Path | None, what: str) -> Iterator[Progress]:
     try:
         yield bar
     except KeyboardInterrupt:
-        said = f"stopped at {bar.done:,} of {bar.total:,} {what}" if bar.total else "stopped"
+        message = "stopped"
+        if bar.total:
+            message += f" at {bar.done:,} of {bar.total:,} {what}"
         if not path:
-            said += "; nothing is saved without -o FILE"
+            message += "; nothing is saved without -o FILE"
         elif part_of(path).exists():
-            said += f"; the same command resumes from {part_of(path)}"
-        raise KeyboardInterrupt(said) from None
+            message += f"; the same command resumes from {part_of(path)}"
+        raise KeyboardInterrupt(message) from None
     finally:
         bar.close()

@@ -45,16 +45,16 @@ def robots(_: Namespace) -> Report:
     notes = []
     result = dict[str, object]()
     for name in fflin.list_robots():
-        found = find_robot(name)
+        robot_file = find_robot(name)
         try:
             with warnings.catch_warnings():
                 # Ignore the warnings of `load` here, because `fflin info` shows them.
                 warnings.simplefilter("ignore", FflinWarning)
                 robot = fflin.load(name)
-            rows.append([name, str(robot.n), f"{robot.mass:.6g}", found.origin])
+            rows.append([name, str(robot.n), f"{robot.mass:.6g}", robot_file.origin])
             result[name] = {"n": robot.n, "mass": robot.mass}
         except FflinError as error:
-            reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
+            reason = str(error).replace(f"{robot_file.path.parent}{os.sep}", "")
             notes.append(folded([f"{name} does not load: {reason}"]))
             result[name] = {"error": reason}
     head = f"{len(rows) - 1} robots can be loaded by name; {len(notes)} cannot be loaded"
@@ -75,13 +75,17 @@ def info(arguments: Namespace) -> Report:
 
     robot = load_robot(arguments)
     q, v = state_of(robot, arguments, robot.point)
-    properties = point_properties(robot, q, np.zeros(robot.nv) if v is None else v)
+    v = np.zeros(robot.nv) if v is None else v
+    properties = point_properties(robot, q, v)
     state, limits = fflin.StateMap(robot), limits_of(robot)
     inputs = Actuation(state)
     rows = [["input", "unit", "min", "max"]]
     for name, unit in zip(inputs.names, inputs.units, strict=True):
         ends = limits.get(name, (-math.inf, math.inf))
-        rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
+        row = [name, unit]
+        for end in ends:
+            row.append(f"{end:.5g}" if math.isfinite(end) else ".")
+        rows.append(row)
     table = grid(cut(rows, "see --json"), "ll")
     text = f"{robot_info(robot, str(properties))}\n\n{table}"
     notes = robot.notes
@@ -111,17 +115,17 @@ def init(arguments: Namespace) -> Report:
     from fflin.robot.catalog import find_robot
     from fflin.robot.summary import draft
 
-    found = find_robot(arguments.robot)
-    if found.path.suffix.lower() == ".toml":
-        raise InputError(f"{found.path} is already a robot file; give the path of a URDF")
-    target = arguments.output_file or Path(f"{found.name}.toml")
+    robot_file = find_robot(arguments.robot)
+    if robot_file.path.suffix.lower() == ".toml":
+        raise InputError(f"{robot_file.path} is already a robot file; give the path of a URDF")
+    target = arguments.output_file or Path(f"{robot_file.name}.toml")
     if target.exists() and not arguments.force:
         raise FileError(
             f"{target} already exists; give another name with -o, or replace the file with --force"
         )
-    urdf = found.name
-    if found.origin == "file":
-        urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
+    urdf = robot_file.name
+    if robot_file.origin == "file":
+        urdf = os.path.relpath(os.path.realpath(robot_file.path), os.path.realpath(target.parent))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         robot = fflin.load(arguments.robot)
@@ -190,15 +194,16 @@ def check(arguments: Namespace) -> Report:
     if arguments.trajectory:
         along = models_along(arguments)
         robot = along.robot
-        found = along.check(tolerance=arguments.tolerance)
-        text = f"{found}\n\n{along}"
+        comparison = along.check(tolerance=arguments.tolerance)
+        text = f"{comparison}\n\n{along}"
     else:
         robot, lin = linear_model(arguments)
-        found = fflin.check(robot, lin, tolerance=arguments.tolerance)
-        text = str(found)
-    result = {"ok": found.ok, "max_error": found.max_error, "rows": found.rows}
-    files = {arguments.plot: lambda path: fflin.plot_check(found, path)}
-    return Report(robot.name, result, text, files, DONE if found.ok else FELL_SHORT)
+        comparison = fflin.check(robot, lin, tolerance=arguments.tolerance)
+        text = str(comparison)
+    result = {"ok": comparison.ok, "max_error": comparison.max_error, "rows": comparison.rows}
+    files = {arguments.plot: lambda path: fflin.plot_check(comparison, path)}
+    code = DONE if comparison.ok else FELL_SHORT
+    return Report(robot.name, result, text, files, code)
 
 
 def model_report(lin: fflin.LinearModel) -> str:
@@ -210,8 +215,9 @@ def model_report(lin: fflin.LinearModel) -> str:
     point = "a fixed point" if stays else "not a fixed point"
     if stays and (lin.moving or f0.any()):
         point = "a relative equilibrium"
-    sampled = f", sampled every {lin.dt:g} s" if lin.dt else ""
-    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}{sampled}"
+    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}"
+    if lin.dt:
+        head += f", sampled every {lin.dt:g} s"
     head += f"; the operating point is {point}"
     parts = [folded([head, *_units(lin)])]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
@@ -219,7 +225,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     # poles do not determine stability. If A^2 = 0, do not compute the poles, because all of them
     # are zero.
     moving = stays and not lin.dt and (lin.A @ lin.A).any()
-    if growing := fflin.modes(lin).unstable if moving else ():
+    growing = fflin.modes(lin).unstable if moving else ()
+    if growing:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(folded([f"unstable poles (positive real part): {shown}"]))
     vectors = (
@@ -232,12 +239,17 @@ def model_report(lin: fflin.LinearModel) -> str:
     x, u, y = lin.state_names, lin.input_names, lin.output_names
     matrices = [("A", x, x), ("B", x, u), ("C", y, x), ("D", y, u)]
     of_states = y == x and not lin.D.any()
-    for title, rows, columns in matrices[:2] if of_states else matrices:
+    if of_states:
+        matrices = matrices[:2]
+    for title, rows, columns in matrices:
         values = getattr(lin, title)
         text = f"{title} ({len(rows)} x {len(columns)})"
         if values.any():
             text += "; rows and columns of zeros are not shown\n\n"
-        parts.append(text + (matrix(values, rows, columns) if values.any() else " is zero"))
+            text += matrix(values, rows, columns)
+        else:
+            text += " is zero"
+        parts.append(text)
     if of_states:
         parts.append("C = I, D = 0: the output is the state")
     c = lin.certificate
@@ -261,15 +273,19 @@ def _units(lin: fflin.LinearModel) -> list[str]:
     lines = []
     for title, (names, units) in signals.items():
         groups = ", ".join(
-            f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
-            for first, last, group, of in runs(names, units)
+            f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{unit}]"
+            for first, last, group, unit in runs(names, units)
         )
         lines.append(f"{title}: {groups}")
     return lines
 
 
 def _rate(unit: str) -> str:
-    return "1/s" if unit == "1" else f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+    if unit == "1":
+        return "1/s"
+    if unit.endswith("/s"):
+        return f"{unit}^2"
+    return f"{unit}/s"
 
 
 def analyze(arguments: Namespace) -> Report:
@@ -278,29 +294,29 @@ def analyze(arguments: Namespace) -> Report:
     example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
     """
     _, lin = linear_model(arguments)
-    moved, shown, found = fflin.controllability(lin), fflin.observability(lin), fflin.modes(lin)
-    parts = {"inputs": moved, "momentum": _momentum(lin), "modes": found, "outputs": shown}
-    poles = counted(len(found.unstable), "unstable pole")
-    if not found.equilibrium:
+    moved, shown, lin_modes = fflin.controllability(lin), fflin.observability(lin), fflin.modes(lin)
+    parts = {"inputs": moved, "momentum": _momentum(lin), "modes": lin_modes, "outputs": shown}
+    poles = counted(len(lin_modes.unstable), "unstable pole")
+    if not lin_modes.equilibrium:
         poles += " of the frozen A"  # away from an equilibrium, poles do not decide stability
     head = [_rank(moved, "controllable"), _rank(shown, "observable"), poles]
     sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
-    result = {"controllability": moved, "observability": shown, "modes": found}
+    result = {"controllability": moved, "observability": shown, "modes": lin_modes}
     text = "\n\n".join([", ".join(head), *sections])
-    files = {arguments.plot: lambda path: fflin.plot_modes(found, path)}
+    files = {arguments.plot: lambda path: fflin.plot_modes(lin_modes, path)}
     return Report(lin.robot, result, text, files)
 
 
-def _rank(found: fflin.Controllability | fflin.Observability, adjective: str) -> str:
+def _rank(ranks: fflin.Controllability | fflin.Observability, adjective: str) -> str:
     """Return whether all states are controllable, or observable, for the headline."""
     from fflin.analysis.ranks import FROZEN
 
-    nx = len(found.basis)
-    if found.bound < nx:
-        most = "at most " if found.method == FROZEN else ""
-        return f"not {adjective} ({most}{found.bound}/{nx})"
-    if found.method == FROZEN:
-        return f"{found.dimension}/{nx} {adjective} by frozen matrices"
+    nx = len(ranks.basis)
+    if ranks.bound < nx:
+        most = "at most " if ranks.method == FROZEN else ""
+        return f"not {adjective} ({most}{ranks.bound}/{nx})"
+    if ranks.method == FROZEN:
+        return f"{ranks.dimension}/{nx} {adjective} by frozen matrices"
     return adjective
 
 
@@ -310,19 +326,19 @@ def modes(arguments: Namespace) -> Report:
     example: fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100
     """
     robot, lin = linear_model(arguments)
-    found = fflin.modes(lin)
-    result: dict[str, object] = {"modes": found}
+    lin_modes = fflin.modes(lin)
+    result: dict[str, object] = {"modes": lin_modes}
     if any(robot.stiffness.values()):
         result["effective_masses"] = fflin.effective_masses(lin)
     parts = [str(part) for part in result.values()]
-    if robot.orbit and not found.equilibrium:
+    if robot.orbit and not lin_modes.equilibrium:
         parts.append(
             "for the modes about an equilibrium in orbit, add --equilibrium or "
             "--relative-equilibrium"
         )
     files = {
-        arguments.plot: lambda path: fflin.plot_modes(found, path),
-        arguments.html: lambda path: fflin.visualize(robot, found, html=path),
+        arguments.plot: lambda path: fflin.plot_modes(lin_modes, path),
+        arguments.html: lambda path: fflin.visualize(robot, lin_modes, html=path),
     }
     return Report(robot.name, result, "\n\n".join(parts), files)
 
@@ -342,22 +358,31 @@ def equilibrium(arguments: Namespace) -> Report:
     axes = {"frame": arguments.frame, "reference": reference}
     held = fflin.equilibrium(robot, q, v=v, **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)
-    found = fflin.modes(lin)
-    poles = found.poles
+    lin_modes = fflin.modes(lin)
+    poles = lin_modes.poles
     growth = float(poles.real.max(initial=-math.inf))
-    decays = not found.zero_eigenvalues and all(mode.margin < -1.0 for mode in found.modes)
-    stability = "unstable" if found.unstable else "stable" if decays else "marginally stable"
+    decays = not lin_modes.zero_eigenvalues and all(mode.margin < -1.0 for mode in lin_modes.modes)
+    stability = "marginally stable"
+    if lin_modes.unstable:
+        stability = "unstable"
+    elif decays:
+        stability = "stable"
+    state = "x0: all zero"
+    if lin.x0.any():
+        state = signals("x0", lin.x0, lin.state_names, lin.state_units)
     lines = [
         f"{robot.name}: {stability}; the largest real part of a pole is {growth:.3g} 1/s, "
-        f"{counted(found.zero_eigenvalues, 'eigenvalue')} at zero",
-        signals("x0", lin.x0, lin.state_names, lin.state_units) if lin.x0.any() else "x0: all zero",
+        f"{counted(lin_modes.zero_eigenvalues, 'eigenvalue')} at zero",
+        state,
         str(held),
         *(folded([note]) for note in wheel_notes(lin)),
     ]
     names = (*lin.state_names, *lin.input_names)
-    there = dict(zip(names, (*lin.x0, *held.u), strict=True))
+    value_of = dict(zip(names, (*lin.x0, *held.u), strict=True))
     limits = limits_of(robot).items()
-    excess = {k: max(low - there[k], there[k] - high) for k, (low, high) in limits if k in there}
+    excess = {
+        k: max(low - value_of[k], value_of[k] - high) for k, (low, high) in limits if k in value_of
+    }
     beyond = [name for name, size in excess.items() if size > _SLACK]
     if beyond:
         lines.append(folded([f"beyond their limits: {listed(beyond)}"]))
@@ -369,7 +394,7 @@ def equilibrium(arguments: Namespace) -> Report:
         "x0": lin.x0,
         "stability": stability,
         "largest_real_part": growth,
-        "zero_eigenvalues": found.zero_eigenvalues,
+        "zero_eigenvalues": lin_modes.zero_eigenvalues,
         "poles": poles,
     }
     entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
@@ -392,17 +417,16 @@ def _momentum(lin: fflin.LinearModel) -> str:
             f"reduced by the conserved momentum has {len(reduced.A)} states"
         )
     elif not lin.is_equilibrium():
+        cause = "the orbit" if lin.mean_motion else "inputs"
         text = (
             "no momentum can be removed: the operating point is not an equilibrium, and "
-            f"{'the orbit' if lin.mean_motion else 'inputs'} may change every component of the "
-            "momentum"
+            f"{cause} may change every component of the momentum"
         )
     else:
-        orbit = "the orbit, " * bool(lin.mean_motion)
-        text = (
-            f"no momentum is conserved, because {orbit}inputs, springs or dampers change every "
-            "component of the momentum"
-        )
+        causes = "inputs, springs or dampers"
+        if lin.mean_motion:
+            causes = f"the orbit, {causes}"
+        text = f"no momentum is conserved, because {causes} change every component of the momentum"
     return folded([text, *(f"note: {note}" for note in reduced.notes)])
 
 
@@ -414,9 +438,12 @@ def sensitivity(arguments: Namespace) -> Report:
     from fflin.uncertainty.sensitivity import sensitivity_record
 
     _, lin = linear_model(arguments)
-    found = fflin.sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
-    text = found.table(arguments.top, arguments.only)
-    return Report(lin.robot, sensitivity_record(found), text, {arguments.output_file: found.save})
+    model = lin if arguments.dt is None else lin.discretize(arguments.dt)
+    derivatives = fflin.sensitivity(model)
+    text = derivatives.table(arguments.top, arguments.only)
+    return Report(
+        lin.robot, sensitivity_record(derivatives), text, {arguments.output_file: derivatives.save}
+    )
 
 
 def uncertain(arguments: Namespace) -> Report:

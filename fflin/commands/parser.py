@@ -74,7 +74,9 @@ class OutputFile:
 
     def __str__(self) -> str:
         *first, last = self.endings
-        return f"{', '.join(first)} or {last}" if first else last
+        if first:
+            return f"{', '.join(first)} or {last}"
+        return last
 
 
 def assignment(text: str) -> tuple[str, float]:
@@ -90,12 +92,16 @@ def joint_or_all(text: str) -> tuple[str | None, float | str]:
     """
     if "=" in text:
         return assignment(text)
-    return None, text if text == "urdf" else number(text)
+    if text == "urdf":
+        return None, text
+    return None, number(text)
 
 
 def lock(text: str) -> tuple[str, float | None]:
     """Read NAME=VALUE or NAME; return (name, value), or (name, None) for the neutral position."""
-    return assignment(text) if "=" in text else (text, None)
+    if "=" in text:
+        return assignment(text)
+    return text, None
 
 
 def xacro_argument(text: str) -> tuple[str, str]:
@@ -119,8 +125,10 @@ def parameter_range(text: str) -> tuple[str, object]:
     name, ends = _parts(text, "NAME=FRACTION or NAME=LEAST:LARGEST", 1, 2)
     tied = ends[-1].endswith(",tied")
     ends[-1] = ends[-1].removesuffix(",tied")
-    found = tuple(map(number, ends)) if ends[1:] else number(ends[0])
-    return name, {"range": found, "tied": True} if tied else found
+    bounds = tuple(map(number, ends)) if ends[1:] else number(ends[0])
+    if tied:
+        return name, {"range": bounds, "tied": True}
+    return name, bounds
 
 
 # Largest number of values of one joint in a grid. They are all in memory.
@@ -330,12 +338,12 @@ def add_command(
     command.add_argument("-h", "--help", nargs="?", metavar="all", action=Help, help=about)
     command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
     for title, options in ((OUTPUT, "json"), *OPTIONS[name].items()):
-        groups = {"": command, **{each.title: each for each in command._action_groups}}
+        groups = {"": command, **{existing.title: existing for existing in command._action_groups}}
         group = groups.get(title) or command.add_argument_group(title, DESCRIPTIONS.get(title))
         for option in options.split():
-            own = f"{name} {option}"
-            text = ABOUT.get(own) or ABOUT[option]
-            form = FORMS.get(own) or FORMS.get(option, {"action": "store_true"})
+            key = f"{name} {option}"
+            text = ABOUT.get(key) or ABOUT[option]
+            form = FORMS.get(key) or FORMS.get(option, {"action": "store_true"})
             reader, default = form.get("type"), form.get("default")
             if isinstance(reader, OutputFile):
                 text = text.replace("FILE", f"FILE: {reader}")
@@ -373,22 +381,27 @@ class Help(argparse.Action):
 
 def short_help(command: argparse.ArgumentParser) -> str:
     """Return the short help of a command, with one sentence about each of its common options."""
-    arguments = [each for each in command._actions if not each.option_strings]
-    _, *every = (each for each in command._actions if each.option_strings)
-    options = {each.dest.replace("_", "-"): each for each in every}
-    common = [*common, "json"] if (common := command.get_default("common")) else [*options]
+    arguments = [action for action in command._actions if not action.option_strings]
+    _, *every = (action for action in command._actions if action.option_strings)
+    options = {action.dest.replace("_", "-"): action for action in every}
+    common = command.get_default("common")
+    names = [*common, "json"] if common else [*options]
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
-    required = [f"{each.option_strings[-1]} {each.metavar}" for each in every if each.required]
-    operands = [command.prog, *(str(each.metavar) for each in arguments), *required]
+    required = [
+        f"{action.option_strings[-1]} {action.metavar}" for action in every if action.required
+    ]
+    operands = [command.prog, *(str(action.metavar) for action in arguments), *required]
     formatter.add_text(f"usage: {' '.join(operands)} [options]")
     formatter.add_text(command.description)
-    shown = {"arguments": arguments, "options": [options[name] for name in common]}
+    shown = {"arguments": arguments, "options": [options[name] for name in names]}
     for title, actions in shown.items():
         formatter.start_section(title)
         for action in map(copy.copy, actions):
             text = action.help or ""
             first = re.split(r"; |(?<!\.)\. ", text.removesuffix(_REPEATABLE))[0]
-            action.help = first + _REPEATABLE * text.endswith(_REPEATABLE)
+            action.help = first
+            if text.endswith(_REPEATABLE):
+                action.help += _REPEATABLE
             formatter.add_argument(action)
         formatter.end_section()
     formatter.add_text(command.epilog)
@@ -400,14 +413,14 @@ def short_help(command: argparse.ArgumentParser) -> str:
 def settle_former_names(arguments: argparse.Namespace) -> None:
     """Accept former option names with a warning: --step (now --dt) and --dt (now --sample)."""
     if (step := getattr(arguments, "step", None)) is not None:
-        said = "the integration step --step has the new name --dt"
+        message = "the integration step --step has the new name --dt"
         if arguments.dt is not None:
-            said += ", and the sample time --dt has the new name --sample"
+            message += ", and the sample time --dt has the new name --sample"
             arguments.sample = arguments.dt
         arguments.dt = step
     elif (sample := getattr(arguments, "former_dt", None)) is not None:
-        said = f"--dt has the new name --sample; write --sample {sample:g}"
+        message = f"--dt has the new name --sample; write --sample {sample:g}"
         arguments.sample = sample
     else:
         return
-    warnings.warn(said, FflinWarning, stacklevel=2)
+    warnings.warn(message, FflinWarning, stacklevel=2)

@@ -125,11 +125,11 @@ def write_c(
     contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
     with failing(target, "written"):
         old = next((x for x in contents if target.exists() and x in {*target.iterdir()}), None)
-        new = [each for each in (target, *target.parents) if not each.exists()]
-    there = None
+        new = [directory for directory in (target, *target.parents) if not directory.exists()]
+    written_title = None
     with suppress(FileError, TypeError):
-        there = _description(target / f"{name}.json")["title"]
-    if old and there != title:
+        written_title = _description(target / f"{name}.json")["title"]
+    if old and written_title != title:
         raise InputError(
             f"{old} exists and does not belong to the {title}, or the code was edited; give "
             "another name= (--name) or another folder, or delete the files of this name"
@@ -139,9 +139,9 @@ def write_c(
             target.mkdir(parents=True, exist_ok=True)
         write_atomically(contents)
     except BaseException:
-        for each in new:  # leave no empty folder
+        for directory in new:  # leave no empty folder
             with suppress(OSError):
-                each.rmdir()
+                directory.rmdir()
         raise
     return target
 
@@ -223,14 +223,14 @@ class CLaw(Policy):
         with failing(as_path(folder), "read"):
             source = as_path(folder).resolve()
             pairs = sorted(x.stem for x in source.iterdir() if x.suffix == ".json")
-            found = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
+            names = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
         self._made = partial(CLaw, source, name=name, compiler=compiler)
-        if not found:
-            named = f" named '{name}'" if name else ""
-            raise FileError(f"{source}: contains no C code{named} that fflin.write_c wrote")
-        if len(found) > 1:
-            raise FileError(f"{source}: contains the laws {listed(found)}; choose one with name=")
-        [self.name] = found
+        if not names:
+            wanted = f"C code named '{name}'" if name else "C code"
+            raise FileError(f"{source}: contains no {wanted} that fflin.write_c wrote")
+        if len(names) > 1:
+            raise FileError(f"{source}: contains the laws {listed(names)}; choose one with name=")
+        [self.name] = names
         self._about = _description(source / f"{self.name}.json")
         self.dt: float = self._about["dt"]
         self.frame: Frame = self._about["frame"]
@@ -283,8 +283,12 @@ class CLaw(Policy):
         require_turns(made, self._about["nq"], robot)
         if self._about["kind"] == "output":
             q, v = map(np.array, self._about["point"])
-            there, sizes = (Measuring(state, q), state.read(q, v)), (self._about["memory"], 0)
-            return Loop(state, self.dt, sizes, lambda t: (partial(self._output_step, t), *there))
+            measuring = Measuring(state, q)
+            x = state.read(q, v)
+            sizes = (self._about["memory"], 0)
+            return Loop(
+                state, self.dt, sizes, lambda t: (partial(self._output_step, t), measuring, x)
+            )
         world = StateMap(robot, frame=state.frame)
         n = robot.n
         # C has no empty arrays. So the C arrays for the joints have one entry if there is no joint.
@@ -329,8 +333,8 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
     """Compile a C source file to a shared library, and return the loaded library."""
     if not isinstance(compiler, str) or "\0" in compiler:
         raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
-    found = shutil.which(compiler)
-    if found is None:
+    program = shutil.which(compiler)
+    if program is None:
         raise MissingPackageError(
             f"there is no C compiler '{compiler}'; install one, such as gcc, or give compiler="
         )
@@ -338,7 +342,7 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
         with tempfile.TemporaryDirectory() as folder:
             library = Path(folder) / "law.so"
             flags = ["-std=c99", "-O2", "-fPIC", "-shared", "-ffp-contract=off"]
-            command = [found, *flags, "-o", str(library), str(source), "-lm"]
+            command = [program, *flags, "-o", str(library), str(source), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
@@ -354,7 +358,11 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     names, units = law.inputs
     kind = "state" if state else "output"
     title = f"{law.title} of '{robot.name}'"
-    frame = state.frame if state else lin.frame if lin else ""
+    frame = ""
+    if state:
+        frame = state.frame
+    elif lin:
+        frame = lin.frame
     # Largest rounding error that the test program accepts, relative to `Case.scale`, the sum of the
     # magnitudes of the terms. In single precision, the error is the unit roundoff 2^-24 times the
     # number of operations.
@@ -370,8 +378,10 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         status = int((out != case.out).any())
         vectors.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
     outs = [*map(_plain, names), *(f"next z[{k}]" for k in range(len(out) - len(names)))]
+    of_type = _DOUBLE if real == "double" else _FLOAT
+    signal = "x" if state else "y"
     words: dict[str, object] = {
-        **(_DOUBLE if real == "double" else _FLOAT),
+        **of_type,
         **{key: array(table) for key, table in tables.items()},
         **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
         **{"law": law.title, "frame": frame or "not known", "robot": _plain(robot.name)},
@@ -382,10 +392,10 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "error": f"{error:.2g}",
         "tolerances": _listed("u", names, sizes),
         **{"inputs": len(names), "input_list": _listed("u", names, units), "row": "0"},
-        f"{kind}_list": _listed("x" if state else "y", *law.signals),
+        f"{kind}_list": _listed(signal, *law.signals),
         "vectors": "{\n" + ",\n".join(vectors) + "}",
         **{"ins": len(case.given), "outs": len(outs)},
-        "out_names": ",\n".join(f'    "{each}"' for each in outs),
+        "out_names": ",\n".join(f'    "{out_name}"' for out_name in outs),
     }
     if state:
         words |= _state_words(law, state)
@@ -401,12 +411,16 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         **{"title": title, "real": real, "frame": frame, "dt": law.dt},
         "kind": "samples" if len(tables["u0"]) > 1 else kind,
         "signals": {"input": law.inputs, kind: law.signals},
-        "nq": len(lin.q) if lin else robot.nq,
+        "nq": robot.nq,
         "u0": tables["u0"][0].tolist(),
         "memory": 0 if state else len(tables["A"]),
-        "reference": None if lin is None else lin.placement.tolist(),
-        "point": None if lin is None else [lin.q.tolist(), lin.v.tolist()],
+        "reference": None,
+        "point": None,
     }
+    if lin is not None:
+        about["nq"] = len(lin.q)
+        about["reference"] = lin.placement.tolist()
+        about["point"] = [lin.q.tolist(), lin.v.tolist()]
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}

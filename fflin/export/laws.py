@@ -95,14 +95,13 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     if robot is None:
         # A law that was read from a file contains only the robot's name, which `load` may know.
         with suppress(FflinError):
-            robot = load(lin.robot if lin else getattr(given, "robot", ""))
+            name = lin.robot if lin else getattr(given, "robot", "")
+            robot = load(name)
     robot = instance("robot", robot, (Robot, type(None)), "a Robot")
-    if robot is None or (own := robot.urdf_sha256) != getattr(lin or given, "urdf_sha256", own):
-        said = f"has another URDF or other masses than '{robot.name}'" if robot else "is not known"
-        raise InputError(
-            f"the robot of this {type(given).__name__} {said}; give the robot of the design with "
-            "robot= (--robot)"
-        )
+    if robot is None:
+        raise _robot_error(given, "is not known")
+    if robot.urdf_sha256 != getattr(lin or given, "urdf_sha256", robot.urdf_sha256):
+        raise _robot_error(given, f"has another URDF or other masses than '{robot.name}'")
     law = _law_of(given, robot)
     high = np.full(len(law.inputs[0]), np.inf)
     low = -high
@@ -124,6 +123,14 @@ def _not_written(given: object) -> InputError:
     )
 
 
+def _robot_error(given: object, problem: str) -> InputError:
+    """Build the error for the robot of a design, which `problem` describes."""
+    return InputError(
+        f"the robot of this {type(given).__name__} {problem}; give the robot of the design with "
+        "robot= (--robot)"
+    )
+
+
 def _law_of(given: Design, robot: Robot) -> Law:
     """Convert a policy or a controller design for a robot."""
     title = type(given).__name__
@@ -134,8 +141,8 @@ def _law_of(given: Design, robot: Robot) -> Law:
         policy = TrajectoryFeedback(policy.trajectory(robot), policy)
     if isinstance(policy, Gain):
         made = f"the gain was designed for '{policy.robot}'"
-        own = policy._lin or model_of(policy, robot, made, pin.XYZQUATToSE3(policy.placement))
-        policy = StateFeedback(own, policy.K)
+        model = policy._lin or model_of(policy, robot, made, pin.XYZQUATToSE3(policy.placement))
+        policy = StateFeedback(model, policy.K)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time
@@ -275,7 +282,9 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     times = dt * np.arange(int(policy.over / dt) + 3)
     times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
-    attitudes = [quaternion_product(state.origin_quaternion, each) for each in q[:, 3:7]]
+    attitudes = [
+        quaternion_product(state.origin_quaternion, quaternion) for quaternion in q[:, 3:7]
+    ]
     return {
         "reference": np.hstack((state.positions(q), attitudes)),
         "x0": np.hstack((np.zeros((len(q), 6)), state.joint_positions(q), state.velocities(v))),
@@ -335,25 +344,25 @@ def _output_law(
     )
 
 
-def _output_cases(by: Sample, turning: Indices) -> Iterator[Case]:
+def _output_cases(sample: Sample, turning: Indices) -> Iterator[Case]:
     """Yield test cases at random controller states z and outputs y of the robot.
 
     The results of a case are u and the next z.
     """
-    random, (nz, ny) = np.random.default_rng(0), by.B.shape
+    random, (nz, ny) = np.random.default_rng(0), sample.B.shape
     for _ in range(CASES):
         size = 10.0 ** random.uniform(-4, 0)
         z, dy = random.normal(scale=size, size=nz), random.normal(scale=size, size=ny)
         turns = np.zeros(ny)
         turns[turning] = 2.0 * np.pi * random.integers(-3, 4, len(turning))
-        y = by.y0 + dy
+        y = sample.y0 + dy
 
         def measured(_: Array, y: Array = y) -> Array:
             return y
 
-        u, next_z = by.step(z, measured)
+        u, next_z = sample.step(z, measured)
         of_z = np.abs(z)
-        of_y = np.abs(y) + np.abs(by.y0) + np.abs(turns)
-        scale = np.abs(by.u0) + np.abs(by.C) @ of_z + np.abs(by.D) @ of_y
-        after = np.abs(by.A) @ of_z + np.abs(by.B) @ of_y
+        of_y = np.abs(y) + np.abs(sample.y0) + np.abs(turns)
+        scale = np.abs(sample.u0) + np.abs(sample.C) @ of_z + np.abs(sample.D) @ of_y
+        after = np.abs(sample.A) @ of_z + np.abs(sample.B) @ of_y
         yield Case(0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after))

@@ -26,7 +26,9 @@ def bundled_directory() -> Path:
     """Return the folder of the bundled URDFs, in an installed package or in a source checkout."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "bundled"
-    return installed if installed.is_dir() else package.parent / "robots"
+    if installed.is_dir():
+        return installed
+    return package.parent / "robots"
 
 
 @cache
@@ -40,7 +42,7 @@ def _example_robot_data() -> dict[str, RobotFile]:
     # Read only the class attributes of a loader, because creating the loader would load meshes.
     from example_robot_data.robots_loader import ROBOTS, getModelPath
 
-    found = {}
+    robot_files = {}
     for name, loader in ROBOTS.items():
         # The loader of talos_legs inherits the URDF of another robot, and removes joints in code.
         # Therefore talos_legs has no URDF of its own.
@@ -48,8 +50,8 @@ def _example_robot_data() -> dict[str, RobotFile]:
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
             folders = (root.parents[1], root.parent)
-            found[name] = RobotFile(name, root / inner, "example-robot-data", folders)
-    return found
+            robot_files[name] = RobotFile(name, root / inner, "example-robot-data", folders)
+    return robot_files
 
 
 def list_robots() -> tuple[str, ...]:
@@ -99,7 +101,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 def find_inputs(inputs: str | Path) -> Path:
     """Find a file of inputs by its name if the file is bundled, or otherwise by its path."""
     path, name = as_path(inputs), str(inputs)
-    bundled = {each.stem: each for each in sorted(bundled_directory().glob("*.toml"))}
+    bundled = {file.stem: file for file in sorted(bundled_directory().glob("*.toml"))}
     if path.name == name and not path.suffix and not os.path.lexists(path):
         require_known("file or bundled set of inputs", [name], bundled)
     return bundled.get(name, path)

@@ -31,7 +31,11 @@ RULES = ("urdf", "identity")
 def _input_keys(robot: Robot) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
-    return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
+    keys = []
+    for group, name in pairs:
+        key = name if name.startswith(f"{group}.") else f"{group}.{name}"
+        keys.append(key)
+    return tuple(keys)
 
 
 def _given_limits(
@@ -45,8 +49,11 @@ def _given_limits(
     """
     named = robot.named_inputs
     keys, states = _input_keys(robot), state_keys(robot.joint_names)
-    names = [*(name for _, own in named for name in own), *states]
-    floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
+    names = [*(name for _, entries in named for name in entries), *states]
+    floors = []
+    for item, entries in named:
+        floor = -math.inf if item.PULLS else 0.0
+        floors += [floor] * len(entries)
     floors += [-math.inf] * len(states)
     if not isinstance(given, Mapping):
         given = dict.fromkeys((item.GROUP for item in robot.inputs), given)
@@ -56,15 +63,20 @@ def _given_limits(
     # A limit of the whole group q_m or qdot_m does not apply to wheels, because wheels have
     # unbounded angles, and rotate much faster than joints.
     groups: Sequence[str] = ("q_m", "qdot_m")
-    mounted = [own[0] for item, own in named if item.GROUP == "wheel"]
+    mounted = [entries[0] for item, entries in named if item.GROUP == "wheel"]
     spun = robot.wheel_joints if wheels is None else wheels
     excluded = {f"{x}.{name}" for name in (*mounted, *spun) for x in groups}
     whole = {group: of_states.pop(group) for group in groups if group in of_states}
-    found = by_name("input or state", whole, (*keys, *states))
-    found = {i: limits for i, limits in found.items() if names[i] not in excluded}
-    found |= by_name("input or state", of_states, (*keys, *states))
-    found |= by_name("input", of_inputs, keys)
-    return {names[i]: (max(low, floors[i]), max(up, floors[i])) for i, (low, up) in found.items()}
+    limits_of_index = by_name("input or state", whole, (*keys, *states))
+    limits_of_index = {
+        i: limits for i, limits in limits_of_index.items() if names[i] not in excluded
+    }
+    limits_of_index |= by_name("input or state", of_states, (*keys, *states))
+    limits_of_index |= by_name("input", of_inputs, keys)
+    return {
+        names[i]: (max(low, floors[i]), max(up, floors[i]))
+        for i, (low, up) in limits_of_index.items()
+    }
 
 
 def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
@@ -75,7 +87,13 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     for item in given:
         if not isinstance(item, str | Output):
             raise InputError(f"{item!r} is not an output; expected one such as FramePose('tool')")
-    return tuple(y for x in given for y in (parse_output(x) if isinstance(x, str) else (x,)))
+    outputs: list[Output] = []
+    for item in given:
+        if isinstance(item, str):
+            outputs += parse_output(item)
+        else:
+            outputs.append(item)
+    return tuple(outputs)
 
 
 def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
@@ -95,11 +113,11 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
     if what != "rest" and not isinstance(value, Mapping):
         value = dict.fromkeys(joints, value)
     values = numbers(what, value, "joint", f"{what} of joint")
-    found = by_joint(values, joints, robot.joint)
-    for name, entry in found.items():
+    value_of_joint = by_joint(values, joints, robot.joint)
+    for name, entry in value_of_joint.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
-    return found
+    return value_of_joint
 
 
 def require_chart(what: str, size: float) -> None:
@@ -120,18 +138,20 @@ def _bound(what: str, value: object) -> float:
 
 def range_of(name: str, value: object) -> Range:
     """Return a limit as (least, largest); one number x stands for (-x, x)."""
-    what = f"limit of '{name}'"
-    bounds = [*value] if isinstance(value, Iterable) and dimension(what, value) == 1 else []
+    label = f"limit of '{name}'"
+    bounds = []
+    if isinstance(value, Iterable) and dimension(label, value) == 1:
+        bounds = [*value]
     if len(bounds) == 2:
-        least, largest = (_bound(what, x) for x in bounds)
+        least, largest = (_bound(label, x) for x in bounds)
     else:
-        largest = number(what, value)
+        largest = number(label, value)
         least = -largest
     if name.startswith("q_b") and math.isfinite(size := max(abs(least), abs(largest))):
-        require_chart(what, size)
+        require_chart(label, size)
     if not least <= largest or least == math.inf or largest == -math.inf:
         raise InputError(
-            f"{what} is {value}, expected a largest magnitude of at least 0, or bounds (least, "
+            f"{label} is {value}, expected a largest magnitude of at least 0, or bounds (least, "
             "largest)"
         )
     return least, largest
@@ -173,8 +193,8 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
                 least = "0 or more" if part == "q" else "more than 0"
                 raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
             if part == "bryson" and (key in weights["q"] or key in weights["r"]):
-                said = f"'{key}' has both a weight and a largest value; give only one of them"
-                raise InputError(said)
+                message = f"'{key}' has both a weight and a largest value; give only one of them"
+                raise InputError(message)
     rule = {"rule": given["rule"]} if "rule" in given else {}
     return rule | {part: entries for part, entries in weights.items() if entries}
 
@@ -184,8 +204,8 @@ def checked_names(what: str, value: object, bare: Robot) -> tuple[str, ...]:
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"{what} is {value!r}, expected names of joints")
-    found = by_joint(dict.fromkeys(keys), bare.joint_names, bare.joint)
-    return tuple(name for name in bare.joint_names if name in found)
+    chosen = by_joint(dict.fromkeys(keys), bare.joint_names, bare.joint)
+    return tuple(name for name in bare.joint_names if name in chosen)
 
 
 def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
@@ -218,22 +238,27 @@ def limits_of(robot: Robot) -> dict[str, Range]:
     # Start with the limits of the URDF. Equal lower and upper limits, such as 0 and 0, count as no
     # limit, because exporters write 0 for unknown limits. Limits of the inputs replace limits of
     # the URDF, and `Robot.limits` replaces limits of the URDF and of the inputs.
-    found: dict[str, Range] = {}
+    limits_by_name: dict[str, Range] = {}
     for joint in robot.joints:
         low, high = travel_of(robot.model, joint)
-        found[f"q_m.{joint.name}"] = (low, high) if low < high else _OPEN
-        found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
+        limits_by_name[f"q_m.{joint.name}"] = _OPEN
+        if low < high:
+            limits_by_name[f"q_m.{joint.name}"] = (low, high)
+        limits_by_name[f"qdot_m.{joint.name}"] = _either(
+            float(robot.model.velocityLimit[joint.idx_v])
+        )
     index = {joint.name: joint.idx_v for joint in robot.joints}
     for item, names in robot.named_inputs:
-        found |= dict(zip(names, item.ranges, strict=True))
+        limits_by_name |= dict(zip(names, item.ranges, strict=True))
         if isinstance(item, JointTorque) and item.max is None:
             low, high = _either(float(robot.model.effortLimit[index[item.joint]]))
-            found[names[0]] = (low if item.min is None else item.ranges[0][0], high)
+            least = low if item.min is None else item.ranges[0][0]
+            limits_by_name[names[0]] = (least, high)
         if isinstance(item, ReactionWheel) and item.max_speed is not None:
-            found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
-    known = {*found, *state_keys(robot.joint_names)}
-    found |= {name: limits for name, limits in robot.limits.items() if name in known}
-    return {name: limits for name, limits in found.items() if limits != _OPEN}
+            limits_by_name[f"qdot_m.{names[0]}"] = _either(item.max_speed)
+    known = {*limits_by_name, *state_keys(robot.joint_names)}
+    limits_by_name |= {name: limits for name, limits in robot.limits.items() if name in known}
+    return {name: limits for name, limits in limits_by_name.items() if limits != _OPEN}
 
 
 def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
@@ -242,20 +267,21 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
     The lower limit of a thruster is at least 0. The upper limit of a pulsed thruster is at most its
     own `max`.
     """
-    found: list[Range] = []
+    ranges: list[Range] = []
     for item, names in robot.named_inputs:
         for name in names:
             least, largest = limits.get(name, _OPEN)
-            if len(found) in robot.pulsed_thrusters:
+            if len(ranges) in robot.pulsed_thrusters:
                 largest = min(largest, item.ranges[0][1])
-            least = least if item.PULLS else max(least, 0.0)
+            if not item.PULLS:
+                least = max(least, 0.0)
             if least > largest:
                 raise InputError(
                     f"the lower limit of {name} is {least:g}, above its upper limit {largest:g}; "
                     "correct limits= or the limits of the input"
                 )
-            found.append((least, largest))
-    low, high = np.array(found).T
+            ranges.append((least, largest))
+    low, high = np.array(ranges).T
     return low, high
 
 
@@ -277,10 +303,12 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
     - for a joint position, or if least is not negative: the range largest - least;
     - otherwise: the smaller of -least and largest.
     """
-    sizes = {
-        name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
-        for name, (least, largest) in limits_of(robot).items()
-    }
+    sizes = {}
+    for name, (least, largest) in limits_of(robot).items():
+        if name.startswith("q_m.") or least >= 0.0:
+            sizes[name] = largest - least
+        else:
+            sizes[name] = min(-least, largest)
     return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
 
 
@@ -296,19 +324,21 @@ def chosen_limits(
     contains "urdf" or mappings. The text "urdf" selects all limits of the robot. A limit given in
     `limits` replaces the robot's limit of the same input or state.
     """
-    own, given = dict[str, Range](), dict[str, Range]()
-    several = isinstance(limits, list | tuple) and any(isinstance(x, str | Mapping) for x in limits)
-    for part in limits if isinstance(limits, list | tuple) and several else [limits]:
+    robot_limits, given = dict[str, Range](), dict[str, Range]()
+    parts: Sequence[object] = [limits]
+    if isinstance(limits, list | tuple) and any(isinstance(x, str | Mapping) for x in limits):
+        parts = limits
+    for part in parts:
         if isinstance(part, str):
             if part != "urdf":
                 raise InputError(
                     f"limits is '{part}', expected 'urdf', a largest magnitude, {{input: "
                     "magnitude}, or ['urdf', {input: magnitude}]"
                 )
-            own = limits_of(robot)
+            robot_limits = limits_of(robot)
         elif part is not None:
             given |= _given_limits(part, robot, wheels)
-    return own | given
+    return robot_limits | given
 
 
 def travel_of(model: pin.Model, joint: Joint) -> Range:
@@ -321,9 +351,13 @@ def travel_of(model: pin.Model, joint: Joint) -> Range:
 
 def _either(size: float) -> Range:
     """Return the range (-size, size), or an infinite range if the size is not positive."""
-    return (-_known(size), _known(size)) if size > 0.0 else _OPEN
+    if size > 0.0:
+        return -_known(size), _known(size)
+    return _OPEN
 
 
 def _known(limit: float) -> float:
     # Pinocchio stores a missing limit as the largest double or as infinity.
-    return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)
+    if abs(limit) < 1e300:
+        return limit
+    return math.copysign(math.inf, limit)

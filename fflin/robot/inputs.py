@@ -41,10 +41,13 @@ class Input:
                 raise InputError(f"{self.KEY} {name} is {value!r}, expected a name")
         for name in ("max", "min"):
             value = getattr(self, name)
-            what = f"{self.KEY} {name}"
-            if value is not None:
-                several = len(self.ENTRIES) > 1 and dimension(what, value)
-                self._set(name, three_numbers(what, value) if several else number(what, value))
+            label = f"{self.KEY} {name}"
+            if value is None:
+                continue
+            if len(self.ENTRIES) > 1 and dimension(label, value):
+                self._set(name, three_numbers(label, value))
+            else:
+                self._set(name, number(label, value))
         for least, largest in self.ranges:
             if not least <= largest or largest <= 0.0:
                 raise InputError(
@@ -58,16 +61,20 @@ class Input:
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
         """Limits (least, largest) of each entry of the input; a missing limit is infinite."""
-        largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
+        upper = math.inf if self.max is None else self.max
+        largest = np.broadcast_to(upper, len(self.ENTRIES))
         usual = -largest if self.PULLS else 0.0
-        least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
+        lower = usual if self.min is None else self.min
+        least = np.broadcast_to(lower, len(largest))
         return tuple(zip(least.tolist(), largest.tolist(), strict=True))
 
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames on which this input is mounted."""
         frame: str | None = getattr(self, "frame", None)
-        return () if frame is None else (frame,)
+        if frame is None:
+            return ()
+        return (frame,)
 
 
 class BaseTorque(Input):
@@ -326,22 +333,22 @@ def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tupl
         if not isinstance(item, JointTorque):
             inputs.append(item)
             continue
-        found = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
-        if item.joint in found and item.joint in passive:
+        joints = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
+        if item.joint in joints and item.joint in passive:
             raise InputError(
                 f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
                 "from passive, or the torque from the inputs"
             )
-        inputs += [replace(item, joint=name) for name in found if name not in passive]
+        inputs += [replace(item, joint=name) for name in joints if name not in passive]
     if not inputs:
         raise InputError(
             f"inputs is {value!r}, expected at least one input that is not the torque of a passive "
             "joint"
         )
-    names = [name for _, own in named_inputs(inputs) for name in own]
-    for each in names:
-        if names.count(each) > 1:
-            raise InputError(f"input '{each}' is given twice; remove one of them")
+    names = [name for _, entries in named_inputs(inputs) for name in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"input '{name}' is given twice; remove one of them")
     return tuple(inputs)
 
 
@@ -351,7 +358,7 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
     The default names of thrusters and wheels are thruster_1, ... and wheel_1, ...
     """
     seen: Counter[str] = Counter()
-    found = []
+    named = []
     for item in inputs:
         seen[item.GROUP] += 1
         if isinstance(item, Thruster | ReactionWheel):
@@ -359,11 +366,11 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
         else:
             entries = [item.joint] if isinstance(item, JointTorque) else item.ENTRIES
             names = [f"{item.GROUP}.{entry}" for entry in entries]
-        found.append((item, tuple(names)))
-    return found
+        named.append((item, tuple(names)))
+    return named
 
 
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
     """Return (name, wheel) for each wheel among the inputs, with names as in `named_inputs`."""
-    found = named_inputs(inputs)
-    return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]
+    named = named_inputs(inputs)
+    return [(names[0], item) for item, names in named if isinstance(item, ReactionWheel)]

@@ -45,12 +45,16 @@ class Joint(NamedTuple):
     @property
     def unit(self) -> str:
         """Unit of the joint's position; the joint's rate has this unit per second."""
-        return "kg^0.5 m" if self.kind == "modal" else "m" if self.prismatic else "rad"
+        if self.kind == "modal":
+            return "kg^0.5 m"
+        return "m" if self.prismatic else "rad"
 
     @property
     def force_unit(self) -> str:
         """Unit of the joint's force or torque."""
-        return "kg^0.5 m/s^2" if self.kind == "modal" else "N" if self.prismatic else "N m"
+        if self.kind == "modal":
+            return "kg^0.5 m/s^2"
+        return "N" if self.prismatic else "N m"
 
     @property
     def mode(self) -> bool:
@@ -76,7 +80,10 @@ class Joint(NamedTuple):
     def values(self, q: Array) -> Array:
         """Return this joint's values (..) at configurations q (nq, ..); see `value`."""
         at: Array = q[self.idx_q]
-        return np.arctan2(q[self.idx_q + 1], at) if self.unbounded else at / self.scale
+        values: Array = at / self.scale
+        if self.unbounded:
+            values = np.arctan2(q[self.idx_q + 1], at)
+        return values
 
     def within(self, model: pin.Model) -> Joint:
         """Return this joint with its indices in `model`, which has a joint of the same name."""
@@ -119,10 +126,10 @@ def frame_index(model: pin.Model, name: str) -> int:
     # mistakes a link named "universe" for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
     # Check the type of `name` first. If `name` were an array, the comparison would give an array.
-    found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
-    if not found:
+    indices = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
+    if not indices:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
-    return next((i for i in found if frames[i].type == pin.FrameType.BODY), found[0])
+    return next((i for i in indices if frames[i].type == pin.FrameType.BODY), indices[0])
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
@@ -204,10 +211,12 @@ class Coordinates:
             parts = {(3, 7): "the base quaternion (x, y, z, w) q[3:7]"}
             for at, name in self.unbounded.items():
                 parts[at, at + 2] = f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
-            for (first, last), what in parts.items():
-                normalised(what, near[first:last])
+            for (first, last), label in parts.items():
+                normalised(label, near[first:last])
             near = pin.normalize(self.model, near)
-        return self._followed(near) if self.followers else near
+        if self.followers:
+            near = self._followed(near)
+        return near
 
     def checked_velocity(self, v: ArrayLike) -> Array:
         """Return a velocity v (nv,) unchanged if it is valid, or raise `InputError`."""
@@ -283,13 +292,18 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
     of_joints = {"joints": "axis", "jointPlacements": "placement", "inertias": "inertia"}
     for name in ("names", "parents", *of_joints, "armature", "frames"):
         now, before = list(getattr(model, name)), list(getattr(made, name))
-        now = now[: len(before)] if name == "frames" else now
+        if name == "frames":
+            now = now[: len(before)]
         if now != before:
             at = next((i for i, x in enumerate(before) if now[i : i + 1] != [x]), 0)
             if name in of_joints:
                 return f"the {of_joints[name]} of joint '{made.names[at]}'"
-            return f"the frame '{made.frames[at].name}'" if name == "frames" else f"its {name}"
-    return "" if model.gravity == made.gravity else "its gravity"
+            if name == "frames":
+                return f"the frame '{made.frames[at].name}'"
+            return f"its {name}"
+    if model.gravity != made.gravity:
+        return "its gravity"
+    return ""
 
 
 def joint_of(model: pin.Model, index: int) -> Joint:

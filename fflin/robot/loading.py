@@ -113,29 +113,30 @@ def load(
     >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
     8
     """
-    found, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
+    robot_file, dirs, locks = find_robot(robot), folders(package_dirs), requested(lock)
     arguments = _xacro_arguments(xacro)
     document = None
     later = dict[str, float | None]()
-    of_file = dict[str, object]()
-    if found.path.suffix.lower() == ".toml":
-        document, found, of_file = _read_robot_file(found)
+    file_fields = dict[str, object]()
+    if robot_file.path.suffix.lower() == ".toml":
+        document, robot_file, file_fields = _read_robot_file(robot_file)
         with document.located("lock"):
-            own = requested(of_file.pop("lock", ()))
+            file_locks = requested(file_fields.pop("lock", ()))
         with document.located("xacro"):
-            arguments = _xacro_arguments(of_file.pop("xacro", None)) | arguments
+            arguments = _xacro_arguments(file_fields.pop("xacro", None)) | arguments
         later = locks
-        locks = {name: locks.pop(name, value) for name, value in own.items()}
-    urdf = describe(read_file(found.path, "URDF", SIZE_LIMIT), found.path, arguments)
-    with document.located("lock") if document else nullcontext():
-        loaded = _robot(urdf.model, found.name, locks, urdf.mimics)
-    dirs = (*dirs, *found.package_dirs)
+        locks = {name: locks.pop(name, value) for name, value in file_locks.items()}
+    urdf = describe(read_file(robot_file.path, "URDF", SIZE_LIMIT), robot_file.path, arguments)
+    location = document.located("lock") if document else nullcontext()
+    with location:
+        loaded = _robot(urdf.model, robot_file.name, locks, urdf.mimics)
+    dirs = (*dirs, *robot_file.package_dirs)
     # Register the mesh files now, so that no output file can overwrite them. The meshes are read
     # only later, when the robot is drawn.
-    remember(*filter(None, (find_mesh(uri, found.path, dirs) for uri in urdf.meshes)))
+    remember(*filter(None, (find_mesh(uri, robot_file.path, dirs) for uri in urdf.meshes)))
     loaded = replace(
         loaded,
-        urdf=found.path,
+        urdf=robot_file.path,
         urdf_sha256=urdf.sha256,
         notes=urdf.notes,
         package_dirs=dirs,
@@ -147,7 +148,7 @@ def load(
         },
         file_joints=tuple(urdf.joints),
     )
-    for key, value in of_file.items():
+    for key, value in file_fields.items():
         assert document is not None
         tables = _TABLES.get(key, (key,))
         with document.located(next(x for x in tables if x in document.record)):
@@ -159,10 +160,10 @@ def load(
     # mimics such a joint.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
-    for field, names, text in ignored(urdf.joints, found.path.stem):
-        said = {*getattr(loaded, field, ()), *gone}
-        said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
-        if not {*names} <= said:
+    for field, names, text in ignored(urdf.joints, robot_file.path.stem):
+        named_joints = {*getattr(loaded, field, ()), *gone}
+        named_joints |= {x.joint.name for x in loaded.followers if x.leader.name in named_joints}
+        if not {*names} <= named_joints:
             notes.append(text)
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
@@ -223,7 +224,9 @@ def from_model(
     _check_model(copy, name)
     _normalise_placements(copy)
     robot = _robot(copy, name, requested(lock), {})
-    return robot.replace(**fields) if fields else robot
+    if fields:
+        robot = robot.replace(**fields)
+    return robot
 
 
 def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
@@ -259,8 +262,8 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
     damping = {joint.name: float(model.damping[joint.idx_v]) for joint in joints}
     # Add the damping of each mimic joint to its leader. The factor multiplier^2 keeps the
     # dissipated power the same.
-    for each, leader, multiplier, _ in followers:
-        damping[leader.name] += multiplier**2 * float(model.damping[each.idx_v])
+    for follower, leader, multiplier, _ in followers:
+        damping[leader.name] += multiplier**2 * float(model.damping[follower.idx_v])
     return Robot(model, name, joints, followers, locked=locked, urdf_damping=damping)
 
 
@@ -285,7 +288,7 @@ def _check_model(model: pin.Model, name: str) -> None:
             ),
             f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
         }
-        for fault in (fault for fault, found in faults.items() if found):
+        for fault in (fault for fault, present in faults.items() if present):
             raise ModelError(f"'{name}': joint '{model.names[index]}' has {fault}; correct it")
 
 
@@ -299,7 +302,9 @@ def _normalise_placements(model: pin.Model) -> None:
 
 def _normalised(given: pin.SE3) -> pin.SE3:
     error = np.abs(given.rotation.T @ given.rotation - np.eye(3)).max()
-    return rotated(given) if error > _SKEWED and is_rotation(given.rotation) else given
+    if error > _SKEWED and is_rotation(given.rotation):
+        return rotated(given)
+    return given
 
 
 def body_alone(payload: pin.Inertia, name: str) -> Robot:
@@ -404,11 +409,11 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
             "contains only inputs with --inputs or fflin.load_inputs"
         )
     with document.located("urdf"):
-        found = find_robot(record["urdf"], folder)
-        if found.path.suffix.lower() == ".toml":
-            raise InputError(f"urdf is {found.path}, expected a URDF or a robot's name")
+        urdf_file = find_robot(record["urdf"], folder)
+        if urdf_file.path.suffix.lower() == ".toml":
+            raise InputError(f"urdf is {urdf_file.path}, expected a URDF or a robot's name")
     with document.located("package_dirs"):
-        dirs = (*folders(record.get("package_dirs", ()), folder), *found.package_dirs)
+        dirs = (*folders(record.get("package_dirs", ()), folder), *urdf_file.package_dirs)
     # Nested tables become keys with dots. Only the tables directly below weights, point, target and
     # start, such as point.joints, remain tables.
     values = {key: flat(value) for key, value in record.items()}
@@ -422,20 +427,23 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     if appendages := appendages + _built(document, "slosh", partial(_maker, Slosh, of_tank)):
         values["appendages"] = appendages
     # The robot is named after the TOML file, not after the URDF.
-    found = found._replace(name=file.name, package_dirs=dirs)
+    urdf_file = urdf_file._replace(name=file.name, package_dirs=dirs)
     keys = ("lock", "xacro", *FIELDS)
-    return document, found, {key: values[key] for key in keys if key in values}
+    return document, urdf_file, {key: values[key] for key in keys if key in values}
 
 
 def _xacro_arguments(given: object) -> dict[str, str]:
     """Return the arguments {name: text} of a xacro file, as ROS writes them on a command line."""
     texts = dict[str, str]()
-    for name, value in by_name("xacro", {} if given is None else given, "argument").items():
+    arguments = {} if given is None else given
+    for name, value in by_name("xacro", arguments, "argument").items():
         if not isinstance(value, str | bool | int | float):
             raise InputError(
                 f"xacro argument '{name}' is {value!r}, expected a text, a number or a boolean"
             )
-        texts[name] = str(value).lower() if isinstance(value, bool) else str(value)
+        texts[name] = str(value)
+        if isinstance(value, bool):
+            texts[name] = texts[name].lower()
     return texts
 
 
@@ -464,7 +472,9 @@ def _maker(
     `special` makes an appendage from a Nastran file, or slosh from the size of a cylindrical tank.
     """
     alone = set(signature(special).parameters) - set(signature(make).parameters)
-    return special if alone & set(values) else make
+    if alone & set(values):
+        return special
+    return make
 
 
 def _built(
@@ -481,16 +491,18 @@ def _built(
     for index, table in enumerate(tables):
         values = {**table}
         name = table.get("name")
-        of = f"{key} {index + 1}" + (f" ('{name}')" if isinstance(name, str) else "")
-        with document.located(key, index, of=f"{of}: "):
+        label = f"{key} {index + 1}"
+        if isinstance(name, str):
+            label += f" ('{name}')"
+        with document.located(key, index, of=f"{label}: "):
             build = choose(values)
             parameters = dict(signature(build).parameters)
             if build is FlexibleAppendage:  # these parameters come only from Nastran files
                 del parameters["inertia"], parameters["rigid"]
             require_known(f"key of {key}", values, parameters)
-            for each, parameter in parameters.items():
-                if parameter.default is parameter.empty and each not in values:
-                    raise InputError(f"the key '{each}' is missing; add this key")
+            for parameter_name, parameter in parameters.items():
+                if parameter.default is parameter.empty and parameter_name not in values:
+                    raise InputError(f"the key '{parameter_name}' is missing; add this key")
             for file in {"op4", "asm"} & set(values):
                 values[file] = document.path.parent / str(values[file])
             built.append(build(**values))

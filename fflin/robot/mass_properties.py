@@ -80,7 +80,7 @@ def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
 
 def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
     """Return the new inertia of a body; `value` is an inertia, or {property: new value}."""
-    of = f"of '{name}'"
+    of_body = f"of '{name}'"
     if isinstance(value, pin.Inertia):
         value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
     if not isinstance(value, Mapping):
@@ -89,21 +89,24 @@ def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
             "'inertia': (3, 3)} or a pin.Inertia"
         )
     require_known("mass property", value, _KEYS)
-    mass = positive(f"mass {of}", value["mass"], "kg") if "mass" in value else old.mass
-    com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
+    mass = old.mass
+    if "mass" in value:
+        mass = positive(f"mass {of_body}", value["mass"], "kg")
+    com = vector(f"com {of_body}", value.get("com", old.lever), 3, "a point in the body's frame")
     if "inertia" not in value:
-        return pin.Inertia(mass, com, old.inertia * (mass / old.mass if old.mass else 1.0))
+        scale = mass / old.mass if old.mass else 1.0
+        return pin.Inertia(mass, com, old.inertia * scale)
     hint = " [kg m^2] about the centre of mass"
-    inertia = shaped(f"inertia {of}", value["inertia"], (3, 3), hint)
+    inertia = shaped(f"inertia {of_body}", value["inertia"], (3, 3), hint)
     symmetric = np.abs(inertia - inertia.T).max() <= _SYMMETRIC * np.abs(inertia).max()
     inertia = 0.5 * (inertia + inertia.T)
     least, middle, largest = moments = np.linalg.eigvalsh(inertia).tolist()
     unequal = largest - middle - least > TRIANGLE_SLACK * largest
     if not symmetric or is_impossible(mass, moments) or unequal:
         raise InputError(
-            f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2 "
-            "and is not physically realisable; expected a symmetric matrix with moments of 0 or "
-            "more, none of which exceeds the sum of the other two"
+            f"inertia {of_body} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} "
+            "kg m^2 and is not physically realisable; expected a symmetric matrix with moments of "
+            "0 or more, none of which exceeds the sum of the other two"
         )
     return pin.Inertia(mass, com, inertia)
 
@@ -200,8 +203,9 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
       name of the link.
     """
     model = robot._bare.model
-    found = dict[str, Piece]()
-    bodies = ["base" if joint == ROOT else name for joint, name in enumerate(model.names)]
+    pieces = dict[str, Piece]()
+    bodies = [*model.names]
+    bodies[ROOT] = "base"
     of_body: dict[int, dict[str, Piece]] = {}
     for name, link in robot.links.items():
         if model.existFrame(name, pin.FrameType.BODY):
@@ -217,33 +221,38 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
         axes = pin.SE3.Identity()
         several = len(named) > 1
         whole = Piece(joint, at, inertia.mass, inertia.inertia, axes, bodies[joint], several)
-        total = sum((as_inertia(each) for each in named.values()), pin.Inertia.Zero())
+        total = sum((as_inertia(piece) for piece in named.values()), pin.Inertia.Zero())
         difference = np.abs(total.matrix() - inertia.matrix()).max()
         if difference <= _ROUNDING * np.abs(inertia.matrix()).max():
-            found |= named
-        found.setdefault(next(iter(named)) if len(named) == 1 else bodies[joint], whole)
+            pieces |= named
+        title = bodies[joint]
+        if len(named) == 1:
+            title = next(iter(named))
+        pieces.setdefault(title, whole)
     # Wheels and modes are inserted between the joints. Therefore a joint may have another index in
     # the robot's model than in the bare model.
     now = [robot.model.getJointId(name) for name in model.names]
     now[ROOT] = ROOT
-    return {name: each._replace(joint=now[each.joint]) for name, each in found.items()}
+    return {name: piece._replace(joint=now[piece.joint]) for name, piece in pieces.items()}
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
     """Return the names of the pieces (links and bodies) that match a name or pattern."""
     pieces, link_of = robot.pieces, robot.link_of
-    if key in pieces or key in link_of:
-        return [key if key in pieces else link_of[key]]
+    if key in pieces:
+        return [key]
+    if key in link_of:
+        return [link_of[key]]
     names = [*filterfalse(robot._sums.__contains__, pieces), *link_of]
-    found = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(map(link_of.get, found, found)))
+    matches = [names[i] for i in matching(kind, key, names)]
+    return list(dict.fromkeys(map(link_of.get, matches, matches)))
 
 
 def sums_of(robot: Robot) -> frozenset[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
-    linked = {each.joint for each in robot.pieces.values() if not each.whole}
+    linked = {piece.joint for piece in robot.pieces.values() if not piece.whole}
     pieces = robot.pieces.items()
-    return frozenset(name for name, each in pieces if each.whole and each.joint in linked)
+    return frozenset(name for name, piece in pieces if piece.whole and piece.joint in linked)
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
@@ -324,7 +333,9 @@ def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) 
     inertias = {index: at.act(model.inertias[index]) for index, at in placements.items()}
     mass = sum(inertia.mass for inertia in inertias.values())
     moment = sum(inertia.mass * inertia.lever for inertia in inertias.values())
-    center = moment / mass if mass > 0.0 else np.zeros(3)
+    center = np.zeros(3)
+    if mass > 0.0:
+        center = moment / mass
     to_center = pin.SE3(np.eye(3), -center)
     M = np.diag([*[0.0] * 6, *model.armature[modes]])
     for index, inertia in inertias.items():
@@ -342,11 +353,11 @@ def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) 
 
 def mode_carriers(robot: Robot) -> dict[int, int]:
     """Return {joint of a mode: joint of the body that carries the mode}, in ascending order."""
-    found: dict[int, int] = {}
+    carrier_of: dict[int, int] = {}
     for index in sorted(robot.model.getJointId(joint.name) for joint in robot.modes):
         parent = robot.model.parents[index]
-        found[index] = found.get(parent, parent)
-    return found
+        carrier_of[index] = carrier_of.get(parent, parent)
+    return carrier_of
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
@@ -428,7 +439,9 @@ def _virtual_joints(robot: Robot) -> list[str]:
             return []
         body = children[0]
         chain.append(model.names[body])
-    return chain if len(chain) >= _FEWEST_VIRTUAL else []
+    if len(chain) < _FEWEST_VIRTUAL:
+        return []
+    return chain
 
 
 def require_inertia(robot: Robot) -> None:

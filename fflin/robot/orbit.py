@@ -124,9 +124,9 @@ class CircularOrbit:
             # Do not warn if `mu` is given. In this case, the orbit was read from a saved file, or
             # "earth" is the user's name for another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
-                said = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
-                said += "; altitudes are in metres, so write 400 km as 400e3"
-                warnings.warn(said, FflinWarning, stacklevel=3)
+                message = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
+                message += "; altitudes are in metres, so write 400 km as 400e3"
+                warnings.warn(message, FflinWarning, stacklevel=3)
         known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
         for name, value in known.items():
             object.__setattr__(self, name, value)

@@ -29,7 +29,9 @@ class Output:
     @property
     def signals(self) -> list[tuple[str, str]]:
         """List with (name, unit) of each component; empty if the components are states."""
-        prefix = "/".join(self.frames) + "." * bool(self.frames)
+        prefix = "/".join(self.frames)
+        if self.frames:
+            prefix += "."
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
 

@@ -269,7 +269,10 @@ class Robot(Coordinates):
         # A given table replaces the old table. If `merged` is true, the old entries of all joints
         # that the new table does not name stay. Otherwise, only those of modes stay.
         modes = {joint.name for joint in robot.modes}
-        for key in ("stiffness", "damping", *(("rest", "limits") if merged else ())):
+        tables = ["stiffness", "damping"]
+        if merged:
+            tables += ["rest", "limits"]
+        for key in tables:
             if key in checked:
                 kept = {k: x for k, x in getattr(robot, key).items() if merged or k in modes}
                 checked[key] = kept | checked[key]
@@ -368,10 +371,12 @@ class Robot(Coordinates):
         # `changed` has new joints for the modes. Use the old joints instead, so that the modal
         # amplitudes in q have the same meaning as before.
         model = self.model.copy()
-        own = self.model.inertias
+        inertias = self.model.inertias
         for joint in bodies:
-            at = self.model.getJointId(bare.model.names[joint]) if joint > ROOT else ROOT
-            mounted = bare.model.inertias[joint] - own[at]
+            at = ROOT
+            if joint > ROOT:
+                at = self.model.getJointId(bare.model.names[joint])
+            mounted = bare.model.inertias[joint] - inertias[at]
             model.inertias[at] = other.model.inertias[joint] - mounted
             if model.inertias[at].mass <= 0.0:
                 return changed
@@ -457,8 +462,8 @@ class Robot(Coordinates):
         """
         if not isinstance(name, str):
             raise unknown("joint", name, self.joint_names)
-        if found := next((joint for joint in self.joints if joint.name == name), None):
-            return found
+        if independent := next((joint for joint in self.joints if joint.name == name), None):
+            return independent
         leader = next((x.leader.name for x in self.followers if x.joint.name == name), "")
         if leader:
             raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")

@@ -89,20 +89,20 @@ def obstacles(robot: Robot) -> dict[str, str]:
     mounted = set[int]()
     if frames:
         mounted = {frame.parentJoint for frame in model.frames if frame.name in frames}
-    found = dict[str, str]()
+    reasons = dict[str, str]()
     for joint in robot.joints:
         index = model.getJointId(joint.name)
         if index in carriers:
-            found[joint.name] = "its link carries another joint"
+            reasons[joint.name] = "its link carries another joint"
         elif joint.name in leaders:
-            found[joint.name] = "a mimic joint follows it"
+            reasons[joint.name] = "a mimic joint follows it"
         elif robot.stiffness.get(joint.name):
-            found[joint.name] = "it has a spring"
+            reasons[joint.name] = "it has a spring"
         elif index in mounted:
-            found[joint.name] = "an input or output is mounted on its link"
+            reasons[joint.name] = "an input or output is mounted on its link"
         elif not _is_symmetric(robot, index):
-            found[joint.name] = "its link is not symmetric about the joint axis"
-    return found
+            reasons[joint.name] = "its link is not symmetric about the joint axis"
+    return reasons
 
 
 def rotor_names(robot: Robot) -> tuple[str, ...]:
@@ -151,7 +151,9 @@ def spin_axis(robot: Robot, index: int) -> Array:
     data = joint.createData()
     joint.calc(data, robot.neutral())
     linear, axis = np.split(np.asarray(data.S, dtype=float).ravel(), 2)
-    return np.zeros(3) if linear.any() else axis
+    if linear.any():
+        return np.zeros(3)
+    return axis
 
 
 def motor_of(inputs: Sequence[str], joint: str) -> int | None:

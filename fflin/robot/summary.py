@@ -14,7 +14,7 @@ import pinocchio as pin
 from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.fields import limits_of, travel_of
 from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
-from fflin.robot.joints import ROOT
+from fflin.robot.joints import ROOT, Joint
 from fflin.robot.robot import Robot
 
 _STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
@@ -38,22 +38,21 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     """Return text about a robot's tree, masses and limits, with `at_point` below its heading."""
     modes = {joint.name for joint in robot.modes}
     inputs = sum(len(names) for _, names in robot.named_inputs)
-    counts = [
-        counted(robot.n - len(modes), "joint"),
-        *[counted(len(modes), "mode")] * bool(modes),
-        f"{12 + 2 * robot.n} states",
-        counted(inputs, "input"),
-    ]
+    counts = [counted(robot.n - len(modes), "joint")]
+    if modes:
+        counts.append(counted(len(modes), "mode"))
+    counts += [f"{12 + 2 * robot.n} states", counted(inputs, "input")]
     head = f"{robot.name}: {', '.join(counts)}, mass {robot.mass:.6g} kg"
     head += f"\nfrom {robot.urdf or 'a Pinocchio model'}"
     if robot.orbit:
         head += f"\n{folded([str(robot.orbit)])}"
     tree = _tree(robot)
-    limits = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
-    limited = any(cell != "." for row in tree[1:] for cell in row[3:])
+    limits = ""
+    if any(cell != "." for row in tree[1:] for cell in row[3:]):
+        limits = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
     frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
     names = ", ".join(name for name in dict.fromkeys(frames) if name not in modes)
-    parts = [head, at_point, grid(tree, "ll"), limits * limited, folded(_settings(robot))]
+    parts = [head, at_point, grid(tree, "ll"), limits, folded(_settings(robot))]
     parts.append(f"frames\n{_indented(names, '  ')}")
     if robot.notes:
         parts.append("\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes))))
@@ -70,15 +69,13 @@ def _tree(robot: Robot) -> list[list[str]]:
     masses = [body.mass for body in model.inertias.tolist()]
     for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
         masses[model.parents[index]] += masses[index]
-    kinds = {
-        joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
-        for joint in robot.joints
-        if not joint.mode
-    }
+    kinds = {joint: _kind(joint) for joint in robot.joints if not joint.mode}
     kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
-        kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
+        if offset:
+            sign = "-" if offset < 0 else "+"
+            kinds[joint] += f" {sign} {abs(offset):g}"
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
     rows.append(["(base)", "free", f"{masses[ROOT]:.6g}", ".", ".", ".", "."])
     depth = {ROOT: 0}
@@ -86,11 +83,27 @@ def _tree(robot: Robot) -> list[list[str]]:
         index = model.getJointId(joint.name)
         depth[index] = depth[model.parents[index]] + 1
         rates = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
-        cells = (f"{x:.5g}" if abs(x) < 1e300 else "." for x in (*travel_of(model, joint), *rates))
+        cells = map(_limit, (*travel_of(model, joint), *rates))
         name = "  " * depth[index] + joint.name
         mass = f"{masses[index]:.6g}"
         rows.append([name, kinds[joint], mass, *cells])
     return rows
+
+
+def _kind(joint: Joint) -> str:
+    """Return the type of an independent joint in the words of URDF."""
+    if joint.prismatic:
+        return "prismatic"
+    if joint.unbounded:
+        return "continuous"
+    return "revolute"
+
+
+def _limit(value: float) -> str:
+    """Return a limit as a cell of a table; "." if it is missing."""
+    if abs(value) < 1e300:
+        return f"{value:.5g}"
+    return "."
 
 
 def _settings(robot: Robot) -> list[str]:
@@ -115,18 +128,20 @@ def _settings(robot: Robot) -> list[str]:
     for name in ("point", "target", "start"):
         for part, value in getattr(robot, name).items():
             shown[f"{name}, {part} {_STATE[part]}"] = value
-    lines = [f"{title}: {_said(value)}" for title, value in shown.items() if value]
+    lines = [f"{title}: {_as_text(value)}" for title, value in shown.items() if value]
     return lines + [
         f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}" for x in robot.appendages
     ]
 
 
-def _said(value: object) -> str:
+def _as_text(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} = {_said(each)}" for key, each in value.items())
+        return ", ".join(f"{key} = {_as_text(entry)}" for key, entry in value.items())
     if isinstance(value, tuple | list):
-        return ", ".join(map(_said, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+        return ", ".join(map(_as_text, value))
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value)
 
 
 def _indented(text: str, below: str) -> str:
@@ -147,23 +162,27 @@ def draft(robot: Robot, urdf: str) -> str:
             "# have no motors, uncomment this line, and the springs and dampers below.\n"
             f"# passive = [{names}]\n"
         )
+    if not idle:
+        passive = ""
     M = pin.crba(model, model.createData(), robot.neutral())
     inertia = {joint.name: float(M[joint.idx_v, joint.idx_v]) for joint in idle}
     known = {name: value for name, value in robot.urdf_damping.items() if value}
     guessed = {name: 2.0 * _DAMPED * _SWING * size for name, size in inertia.items()}
     damping = {mark + _text(name): guessed[name] for name in guessed if name not in known}
     damping |= {_text(name): value for name, value in known.items()}
-    limits = {
-        f"# {_text(name)}": f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
-        for name, (low, high) in limits_of(robot).items()
-    }
+    limits = {}
+    for name, (low, high) in limits_of(robot).items():
+        limit = f"{high:.6g}" if low == -high else f"[{low:.6g}, {high:.6g}]"
+        limits[f"# {_text(name)}"] = limit
     candidates, spun = _candidates(robot)
     on_base = [
         frame.name
         for frame in model.frames.tolist()
         if frame.parentJoint == ROOT and frame.type == pin.FrameType.BODY
     ]
-    joint = _text(robot.joint_names[0] if robot.n else "joint_1")
+    first_joint = robot.joint_names[0] if robot.n else "joint_1"
+    joint = _text(first_joint)
+    first_frame = on_base[0] if on_base else "root_joint"
     tables = {
         "damping": {key: f"{value:.6g}" for key, value in damping.items()},
         "stiffness": {
@@ -173,14 +192,17 @@ def draft(robot: Robot, urdf: str) -> str:
     }
     template = Template((Path(__file__).parent / "assets" / "robot.toml").read_text("utf-8"))
     return template.substitute(
-        {key: "".join(f"{k} = {x}\n" for k, x in of.items()) for key, of in tables.items()},
+        {
+            key: "".join(f"{k} = {x}\n" for k, x in entries.items())
+            for key, entries in tables.items()
+        },
         name=_text(robot.name)[1:-1],
         joints=counted(robot.n, "joint"),
         mass=f"{robot.mass:.6g}",
         urdf=_text(urdf),
         joint=joint,
-        frame=_text(on_base[0] if on_base else "root_joint"),
-        passive=passive if names else "",
+        frame=_text(first_frame),
+        passive=passive,
         candidates=candidates,
         lock=", ".join(spun) or joint,
     )
@@ -232,14 +254,15 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
                 _guessed("max_speed", speed, _SPEED, "[rad/s]"),
             ]
         placed = data.oMf[index]
-        said = (
+        remark = (
             f"# Link {_text(frame.name)} at {_vector(placed.translation)} [m], {key} "
             f"{_vector(placed.rotation @ axis)}, both in base axes:"
         )
-        position = ["position = [0, 0, 0]  # [m], in that frame"] * (kind == "thruster")
         about = [f'type = "{kind}"', f"name = {name}", f"frame = {_text(frame.name)}"]
-        lines = ["[[input]]", *about, *position, f"{key} = {_vector(axis)}", *lines]
-        text += f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
+        if kind == "thruster":
+            about.append("position = [0, 0, 0]  # [m], in that frame")
+        lines = ["[[input]]", *about, f"{key} = {_vector(axis)}", *lines]
+        text += f"{fill(remark, 80, subsequent_indent='# ', break_long_words=False)}\n{lock}"
         text += "".join(f"# {line}\n" for line in lines)
     return text, spun
 

@@ -11,10 +11,10 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number, printable
 from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
-from fflin.robot.inputs import ReactionWheel
+from fflin.robot.inputs import Input, ReactionWheel
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import dynamic_parameters, link_mass
-from fflin.robot.outputs import JointOutput
+from fflin.robot.outputs import JointOutput, Output
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import Mimic
 
@@ -29,23 +29,27 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     at = {name: value for name, value in asked.items() if name not in wheels}
     mimics = {f.joint.name: Mimic(f.leader.name, *f[2:]) for f in bare.followers}
     model, left, locked = locked_model(bare.model, at, mimics)
-    gone = wheels | {each.rpartition("=")[0] for each in locked}
-    inputs = [
-        replace(item, name=names[0]) if isinstance(item, ReactionWheel) else item
-        for item, names in robot.named_inputs
-        if getattr(item, "joint", names[0]) not in gone
-    ]
+    gone = wheels | {entry.rpartition("=")[0] for entry in locked}
+    inputs: list[Input] = []
+    for item, names in robot.named_inputs:
+        if getattr(item, "joint", names[0]) in gone:
+            continue
+        if isinstance(item, ReactionWheel):
+            inputs.append(replace(item, name=names[0]))
+        else:
+            inputs.append(item)
     if not inputs:
         raise InputError(
             f"without {', '.join(sorted(gone))}, the robot has no input, but a model needs at "
             "least one input"
         )
-    outputs = [
-        replace(each, joints=tuple(x for x in each.joints if x not in gone))
-        if isinstance(each, JointOutput) and each.joints
-        else each
-        for each in robot.outputs
-    ]
+    outputs: list[Output] = []
+    for output in robot.outputs:
+        if isinstance(output, JointOutput) and output.joints:
+            left_joints = tuple(name for name in output.joints if name not in gone)
+            outputs.append(replace(output, joints=left_joints))
+        else:
+            outputs.append(output)
     locked = (*robot.locked, *locked)
     passive = tuple(name for name in robot.passive if name not in gone)
     spun = tuple(name for name in robot.wheel_joints if name not in gone)
@@ -70,7 +74,9 @@ def locked_model(
         require_known("joint to lock", [name], movable)
 
     given = joints_by_name("joint to lock", requested(lock), movable, find)
-    values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
+    values: dict[str, float | None] = {}
+    for name, position in given.items():
+        values[name] = None if position is None else number(f"lock '{name}'", position)
     for name, mimic in mimics.items():
         if values.get(name) is None and (name in values or mimic.leader in values):
             values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
@@ -80,7 +86,8 @@ def locked_model(
     for name, value in values.items():
         index = model.getJointId(name)
         indices.append(index)
-        locked.append(f"{name}={0.0 if value is None else value!r}")
+        position = 0.0 if value is None else value
+        locked.append(f"{name}={position!r}")
         if value is not None:
             joint_of(model, index).place(q, value)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
@@ -96,7 +103,9 @@ def requested(lock: object) -> dict[str, float | None]:
         names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
-    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(map(str, names))
+    if isinstance(lock, Mapping):
+        return dict(lock)
+    return dict.fromkeys(map(str, names))
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
@@ -129,7 +138,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     def renamed(joint: Joint) -> Joint:
         return joint._replace(name=f"{prefix}.{joint.name}")
 
-    joints = [each.within(model) for each in (*bare.joints, *map(renamed, other.joints))]
+    joints = [joint.within(model) for joint in (*bare.joints, *map(renamed, other.joints))]
     theirs = (Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers)
     both: dict[str, Any] = {
         name: getattr(robot, name)
@@ -147,8 +156,8 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         bare,
         model=model,
         urdf_sha256=sha256(identity.encode() + dynamic_parameters(model)).hexdigest(),
-        joints=tuple(sorted(joints, key=lambda each: each.idx_v)),
-        followers=tuple(each.within(model) for each in (*bare.followers, *theirs)),
+        joints=tuple(sorted(joints, key=lambda joint: joint.idx_v)),
+        followers=tuple(joint.within(model) for joint in (*bare.followers, *theirs)),
         links=both.pop("links"),
     )
     name = f"{robot.name}+{other.name}"
@@ -170,11 +179,12 @@ def _appended(
     added = _reduced(other, [ROOT], pin.neutral(other))
     for index, name in enumerate(added.names.tolist()[1:], start=1):
         added.names[index] = f"{prefix}.{name}"
-    for index, each in enumerate(added.frames):
-        each.name = f"{prefix}.{each.name}" if index else each.name
-    own, names = with_marked_frames(model)
+    for index, added_frame in enumerate(added.frames):
+        if index:
+            added_frame.name = f"{prefix}.{added_frame.name}"
+    marked_model, names = with_marked_frames(model)
     theirs, their_names = with_marked_frames(added, prefix)
-    new = pin.appendModel(own, theirs, frame_index(model, frame), placement)
+    new = pin.appendModel(marked_model, theirs, frame_index(model, frame), placement)
     restore_names(new, names | their_names)
     new.name, new.gravity = model.name, model.gravity
     for part in (model, added):

@@ -49,16 +49,24 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
     wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
-    return "compiled" if wanted else "python"
+    if wanted:
+        return "compiled"
+    return "python"
 
 
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
     plant = plan.plant
-    policy = plan.policy.inner if plan.policy else None
     times = plan.times
-    design = plan.policy.commanded_robot if plan.policy else None
-    form = policy.form(design or plant.robot) if policy else None
+    policy = None
+    form = None
+    robots = [plant.robot]
+    if plan.policy:
+        policy = plan.policy.inner
+        design = plan.policy.commanded_robot
+        form = policy.form(design or plant.robot)
+        if design:
+            robots.append(design)
     reason = ""
     if not numba_is_there():
         reason = without_numba()
@@ -66,11 +74,13 @@ def not_compilable(plan: Plan) -> str:
         reason = "events, callbacks, disturbances and the field of an orbit are computed in Python"
     elif policy is not None and form is None:
         reason = f"a {policy.kind} is computed in Python"
-    for robot in () if reason else (plant.robot, *([design] if design else [])):
+    if reason:
+        return reason
+    for robot in robots:
         at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         if batch_tree(robot) is None or not at_home:
             return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
-    if not reason and policy and isinstance(form, OutputForm):
+    if policy and isinstance(form, OutputForm):
         dt = form.loop.dt
         if dt and abs(times.sample * times.dt - dt) > 1e-6 * dt:
             return "its sample time differs from the compensator's"
@@ -80,7 +90,7 @@ def not_compilable(plan: Plan) -> str:
             measured_at(plant.state)
         except InputError as error:
             return str(error)
-    return reason
+    return ""
 
 
 def noise_generator(seed: float) -> np.random.Generator:
@@ -201,7 +211,7 @@ class LaneLoop:
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
                     messages[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
-                stop = np.array([float(stop_of(each)) for each in messages])
+                stop = np.array([float(stop_of(message)) for message in messages])
                 if done % statistics.span == 0:
                     over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)
                     stop[over] = STOPS.index("stopped")
@@ -243,7 +253,9 @@ class LaneLoop:
         nothing = np.zeros((LANES, size))
         bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
         rows[:] = bias
-        draws = [noise_generator(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
+        draws = []
+        if "seed" in runs:
+            draws = [noise_generator(seed) for seed in runs["seed"][of_lane]]
         drawn = 0
 
         def sense(step: int, last: int) -> None:
@@ -272,9 +284,9 @@ class LaneLoop:
         for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
             if finite:  # the last state of a diverged run may not be finite, so it is not added
                 statistics.add(self.done, last[None])
-            found = statistics.outcome(self.done, stop)
+            outcome = statistics.outcome(self.done, stop)
             for name, rows in out.items():
-                rows[chosen] = found[name][:count][chosen]
+                rows[chosen] = outcome[name][:count][chosen]
 
 
 class LaneRows(Statistics):
@@ -456,9 +468,10 @@ def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) ->
     _, measures, near = zip(*map(loop.at, starts), strict=True)
     nz = len(loop.estimate)
     stages = 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [by._replace(jump=np.broadcast_to(by.jump, nz)) for by in map(form.terms, starts)]
+    terms = [term._replace(jump=np.broadcast_to(term.jump, nz)) for term in map(form.terms, starts)]
     compensator = {
-        key: np.concatenate([getattr(by, key).ravel() for by in terms]) for key in Sample._fields
+        key: np.concatenate([getattr(term, key).ravel() for term in terms])
+        for key in Sample._fields
     }
     measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
@@ -466,7 +479,7 @@ def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) ->
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        origin=np.concatenate([pin.SE3ToXYZQUAT(each.state.origin) for each in measures]),
+        origin=np.concatenate([pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]),
         near=np.concatenate([x[state.groups.q_m] for x in near]),
         filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
         measured=measured,
@@ -505,10 +518,10 @@ def _path(
     end of the trajectory, and the gain for this point.
     """
     motion, schedule = policy.trajectory, policy.schedule
-    shift, speed = (state.velocities(each).ravel() for each in motion.cubics)
+    shift, speed = (state.velocities(cubic).ravel() for cubic in motion.cubics)
     q = list(motion.q)
     u = list(motion.u)
-    held = [each.start for each in motion.actuation.held]
+    held = [part.start for part in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     pieces = schedule.K if schedule.dt else schedule.pieces
     pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)

@@ -238,7 +238,9 @@ class Motion(StatesAndInputs, Design):
         """
         if self.tracked:
             return moving_errors(self.frame, self.x, self.target)
-        return self.x - self.target if self.target.size else None
+        if not self.target.size:
+            return None
+        return self.x - self.target
 
     @property
     def tracked(self) -> bool:
@@ -248,7 +250,9 @@ class Motion(StatesAndInputs, Design):
     @property
     def attitude_error(self) -> Array | None:
         """Angle (N,) [deg] between the base attitude and its target; None without a target."""
-        return attitude_errors(self.x, self.target) if self.target.size else None
+        if not self.target.size:
+            return None
+        return attitude_errors(self.x, self.target)
 
     def then(self, *later: Impact | Motion) -> Motion:
         """Join this motion and later phases into one motion.
@@ -330,7 +334,8 @@ class Motion(StatesAndInputs, Design):
         extrapolated, because they are not recorded. `robot` is required only if the motion was read
         from a file.
         """
-        return along(self, self._robot if robot is None else robot)
+        robot = self._robot if robot is None else robot
+        return along(self, robot)
 
     @property
     def passed(self) -> tuple[Passed, ...]:
@@ -401,10 +406,18 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
     own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
-            here, there = joint_called(robot, name), joint_called(other, name)
-            own_q[:, here.idx_q :][:, : here.nq] = q[:, there.idx_q :][:, : here.nq]
-            own_v[:, here.idx_v :][:, : here.nv] = v[:, there.idx_v :][:, : here.nv]
+            joint, other_joint = joint_called(robot, name), joint_called(other, name)
+            own_q[:, joint.idx_q :][:, : joint.nq] = q[:, other_joint.idx_q :][:, : joint.nq]
+            own_v[:, joint.idx_v :][:, : joint.nv] = v[:, other_joint.idx_v :][:, : joint.nv]
     return own_q, own_v
+
+
+def _named_frame(motion: Motion) -> str:
+    """Return the frame of a motion for messages."""
+    text = f"'{motion.frame}'"
+    if motion.circles:
+        text += " in orbit"
+    return text
 
 
 def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
@@ -413,10 +426,9 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     The appended phase gets the name `name`.
     """
     if (motion.frame, motion.circles) != (whole.frame, whole.circles):
-        where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
         raise InputError(
-            f"'{name}' is in the frame {where}, the first phase in {before}; simulate both in one "
-            "frame"
+            f"'{name}' is in the frame {_named_frame(motion)}, the first phase in "
+            f"{_named_frame(whole)}; simulate both in one frame"
         )
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(
@@ -424,21 +436,23 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
             "that input"
         )
     frame = frame_of(whole._robot, whole.frame)
-    state, there = (StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion))
+    state, other_state = (
+        StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion)
+    )
     last = whole.q[-1]
     near = whole.x[-1]
     t = motion.t - motion.t[0] + whole.t[-1]
-    q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
+    q, v = _seen(state.robot, other_state.robot, last, motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
-        points = there.points(np.atleast_2d(motion.target))[1:]
-        goals = state_history(state, *_seen(state.robot, there.robot, last, *points), near)
+        points = other_state.points(np.atleast_2d(motion.target))[1:]
+        goals = state_history(state, *_seen(state.robot, other_state.robot, last, *points), near)
         both = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in both])
     u = np.zeros((len(t), len(whole.input_names)))  # missing inputs are zero
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
     for held in Actuation(state).held:  # inputs in reference axes
-        u[:, held] = u[:, held] @ there.reference.rotation.T @ state.reference.rotation
+        u[:, held] = u[:, held] @ other_state.reference.rotation.T @ state.reference.rotation
     rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
     joined: dict[str, Any] = {}
     for key in (*rows, "energy", "momentum", "momentum_drift", "com_drift"):

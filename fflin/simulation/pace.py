@@ -140,7 +140,9 @@ class Poles:
             details.append(f"damping ratio {-pole.real / size:.2g}")
         if state:
             details.append(f"mainly {state}")
-        return f"{text} ({', '.join(details)})" if details else text
+        if details:
+            text += f" ({', '.join(details)})"
+        return text
 
     def _main_state(self, pole: complex) -> str:
         """Return the name of the state with the largest participation in the mode of a pole."""
@@ -230,7 +232,8 @@ class Signal:
         cls, name: str, signal: Callable[[float], Array], dt: float | None, duration: float
     ) -> Signal:
         """Return the limit of a function of time, for a given step dt [s] or the default step."""
-        step = min(LONGEST_STEP if dt is None else dt, duration)
+        longest = LONGEST_STEP if dt is None else dt
+        step = min(longest, duration)
         if np.array_equal(signal(0.0), signal(0.0)):
             for _ in range(_TRIALS):
                 if _is_resolved(signal, step, duration):
@@ -240,7 +243,8 @@ class Signal:
 
     def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
         """Return the ratio of the step to the longest step that resolves the function."""
-        return Demand(h / self.step if self.step else 0.0, lambda: self.name)
+        error = h / self.step if self.step else 0.0
+        return Demand(error, lambda: self.name)
 
 
 class Pace:
@@ -253,8 +257,8 @@ class Pace:
 
     def demand(self, h: float) -> Demand:
         """Return the largest step error (11.4) of a step of h [s]; it should be at most 1."""
-        demands = [each.demand(self._method, h, self._duration) for each in self.limits]
-        return max(demands, key=lambda each: each.error, default=Demand(0.0, str))
+        demands = [limit.demand(self._method, h, self._duration) for limit in self.limits]
+        return max(demands, key=lambda limit: limit.error, default=Demand(0.0, str))
 
     def step(self, longest: float = LONGEST_STEP) -> tuple[float, str]:
         """Return the longest accurate step [s] of 1, 2 or 5 units, and the mode that limits it.
@@ -272,15 +276,15 @@ class Pace:
     @property
     def fastest(self) -> Poles | None:
         """The poles of the closed loop if they are constant during the run, or None."""
-        poles = (each for each in self.limits if isinstance(each, Poles))
-        return next((each for each in poles if each.system == CLOSED_LOOP), None)
+        poles = (limit for limit in self.limits if isinstance(limit, Poles))
+        return next((limit for limit in poles if limit.system == CLOSED_LOOP), None)
 
     def remarks(self, h: float) -> Iterator[str]:
         """Yield remarks on a step of h [s] that is too long."""
-        for each in self.limits:
-            if isinstance(each, Signal) and not each.step:
+        for limit in self.limits:
+            if isinstance(limit, Signal) and not limit.step:
                 yield (
-                    f"{each.name} jumps within a step or is random, so no step resolves it; let "
+                    f"{limit.name} jumps within a step or is random, so no step resolves it; let "
                     "it jump only at multiples of dt"
                 )
         demand = self.demand(h)
@@ -334,7 +338,9 @@ def limits_of_step(
     linear = policy.closed_loop()
     if sample:
         loop = _sampled_loop(policy, sample)
-        return limits if loop is None else [*limits, loop]
+        if loop is not None:
+            limits.append(loop)
+        return limits
     if linear is not None:
         loop_names = _loop_names(policy, len(linear[0]))
         limits.append(Poles.of(CLOSED_LOOP, linear[0], loop_names))
@@ -401,7 +407,9 @@ def _sampled_loop(policy: Policy, sample: float) -> SampledLoop | None:
     if generator is None or not np.isclose(sampled.dt, sample):
         return None
     loop = policy.loop_around(sample)
-    return None if loop is None else SampledLoop(sampled, generator, loop)
+    if loop is None:
+        return None
+    return SampledLoop(sampled, generator, loop)
 
 
 def _derivatives(plant: Plant, law: Law, q: Array, v: Array) -> Array | None:

@@ -184,9 +184,8 @@ class Plan:
         self.project = truth("project", options.project) and robot.orbit is None
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
-        self.steered = (
-            policy.fed_back if policy else ()
-        )  # states that the policy feeds back, if known
+        # States that the policy feeds back, if known.
+        self.steered = policy.fed_back if policy else ()
         # Function of time that returns the measurement noise; None if the policy defines no noise.
         self.noise = policy.measurement_noise if policy else None
         # Whether the run ends when the base leaves the attitude chart of the reference.
@@ -256,10 +255,11 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
     # In orbit, the model and the simulation must have the same frame, because q is relative to the
     # orbital frame.
     if target.moving or not theirs or (state.robot.orbit and target.frame != state.frame):
+        wanted = f"a state of '{state.robot.name}' or a model of that robot about a fixed point"
+        if state.robot.orbit:
+            wanted += f" in frame {state.frame!r}"
         raise InputError(
-            f"target is a model of '{target.robot}' in frame '{target.frame}', expected a state of "
-            f"'{state.robot.name}' or a model of that robot about a fixed point"
-            f"{f' in frame {state.frame!r}' * bool(state.robot.orbit)}"
+            f"target is a model of '{target.robot}' in frame '{target.frame}', expected {wanted}"
         )
     near = selection(target.state_names, state.names).T @ target.x0
     return state.to_state(target.q, target.v, near=near)
@@ -282,13 +282,16 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
     if policy and policy.followed_trajectory:
         refuse_orbit(robot, "trajectories to follow")
     if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
-        made, flown = ("in orbit", "not ") if own_frame in ORBITAL else ("without an orbit", "")
+        designed, simulated = "without an orbit", "in orbit"
+        if own_frame in ORBITAL:
+            designed, simulated = "in orbit", "not in orbit"
         raise InputError(
-            f"the policy was designed {made}, frame '{own_frame}', but '{robot.name}' is {flown}in "
-            "orbit; design it for the robot that is simulated"
+            f"the policy was designed {designed}, frame '{own_frame}', but '{robot.name}' is "
+            f"{simulated}; design it for the robot that is simulated"
         )
     reference = own_reference if reference is None else reference
-    return StateMap(robot, reference=reference, frame=own_frame if frame is None else frame)
+    frame = own_frame if frame is None else frame
+    return StateMap(robot, reference=reference, frame=frame)
 
 
 def _functions(options: SimulationOptions) -> tuple[Event, ...]:
@@ -312,7 +315,9 @@ def _inputs_at_start(policy: Policy | None, plant: Plant) -> Array:
     """Return the reference inputs (nu,) of the policy at the start, or zeros if it has none."""
     names = plant.actuation.names
     initial = policy.initial_inputs_for(names) if policy else None
-    return np.zeros(len(names)) if initial is None else initial
+    if initial is None:
+        return np.zeros(len(names))
+    return initial
 
 
 def _warn_beyond_limits(policy: Policy | None, plant: Plant, limits: Saturation) -> None:
@@ -347,7 +352,9 @@ def sample_of(policy: Policy | None, sample: float | None) -> float | None:
     """
     if sample is not None:
         return _positive("sample", sample)
-    return (policy.sample_time or None) if policy else None
+    if policy is None:
+        return None
+    return policy.sample_time or None
 
 
 def step_of(
@@ -408,14 +415,16 @@ def times_of(
     thinned = every is None and steps > _MANY_ROWS
     part = max(samples, 1)
     # If `every` is chosen automatically, rows of a sampled policy are recorded only at samples.
-    few = part * -(-steps // (_FEW_ROWS * part)) if thinned else 1
+    few = 1
+    if thinned:
+        few = part * -(-steps // (_FEW_ROWS * part))
     every = few if every is None else whole("every", every, 1)
     if thinned:
-        said = f"one in {every} steps is recorded; every=1 (--every 1) records all "
-        notes.append(f"{said}{steps:,} steps")
+        message = f"one in {every} steps is recorded; every=1 (--every 1) records all "
+        notes.append(f"{message}{steps:,} steps")
     if every % part and part % every:
-        said = f"a row is recorded every {every} steps, but the controller samples every "
-        notes.append(f"{said}{part} steps, so the rows are not a valid trajectory")
+        message = f"a row is recorded every {every} steps, but the controller samples every "
+        notes.append(f"{message}{part} steps, so the rows are not a valid trajectory")
     times = Times(dt, steps, every, samples, late, tuple(notes))
     _require_possible(options, times, mode, thinned=thinned)
     return times
@@ -430,7 +439,8 @@ def _require_possible(
     """
     steps, dt = times.steps, times.dt
     entries = times.rows * (options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n)
-    if entries > _MOST_ENTRIES or steps > (_ENDLESS if thinned else _MOST_STEPS):
+    most_steps = _ENDLESS if thinned else _MOST_STEPS
+    if entries > _MOST_ENTRIES or steps > most_steps:
         reason = f"; {mode} requires this step" if mode else ""
         raise InputError(
             f"{steps * dt:g} s in steps of {dt:g} s are {steps:.3g} steps and {times.rows:.3g} "
@@ -489,7 +499,8 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     """
     lin = policy.lin
     closed = policy.closed_loop()
-    _, start = policy.deviation(robot)(0.0, q, np.zeros(robot.nv) if v is None else v)
+    v = np.zeros(robot.nv) if v is None else v
+    _, start = policy.deviation(robot)(0.0, q, v)
     assert closed is not None
     loop, dt = closed
     step = dt or _LOOK
@@ -503,8 +514,10 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     wheels = {f"q_m.{name}" for name in lin.wheels}
     for group in ("q_b", "r_b", "q_m"):
         judged = {name for name in policy.fed_back if group_of(name) == group} - wheels
-        of = [i for i, name in enumerate(lin.state_names) if name in judged]
-        error = np.abs(history[:, of]).max(axis=1, initial=0.0)
+        indices = [i for i, name in enumerate(lin.state_names) if name in judged]
+        error = np.abs(history[:, indices]).max(axis=1, initial=0.0)
         away |= error > 0.01 * error.max()
     last = float(np.flatnonzero(away).max(initial=0)) * step
-    return max(SHORTEST, 10.0 * math.ceil(last / 10.0)) if last < 0.99 * LONGEST else SHORTEST
+    if last < 0.99 * LONGEST:
+        return max(SHORTEST, 10.0 * math.ceil(last / 10.0))
+    return SHORTEST

@@ -101,60 +101,69 @@ def plot_motion(
     >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
     >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
     """
-    what, errors = _errors(require_motion(motion))
+    error_label, errors = _errors(require_motion(motion))
     drawn = charts(motion, show)
-    states = [title for title, found in drawn.items() if found[0].group in STATES]
+    states = [title for title, chart in drawn.items() if chart[0].group in STATES]
     others = len(drawn) - len(states) + 1  # including the drift
-    per_row = [3.0, 1.2][: 1 + bool(errors)]  # heights of a chart of states and of the errors below
+    per_row = [3.0]  # height of a chart of states
+    if errors:
+        per_row.append(1.2)  # height of the errors below
     heights = per_row * math.ceil(len(states) / _ACROSS)
     above = len(heights)
     heights += [3.0] * math.ceil(others / _ACROSS)
     spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
     spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
     # A joint has the same colour in all charts.
-    every = [curve for found in drawn.values() for curve in found]
+    every = [curve for chart in drawn.values() for curve in chart]
     joints = dict.fromkeys(curve.short for curve in every if curve.group in JOINTS)
     legends: dict[str, dict[str, Artist]] = {}
     with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
         colors = dict(zip(joints, cycle(len(joints)), strict=True))
         grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
-        for (row, column), (title, found) in zip(spots, drawn.items(), strict=False):
+        for (row, column), (title, chart) in zip(spots, drawn.items(), strict=False):
             panel = figure.add_subplot(grid[row, column])
-            group = found[0].group
+            group = chart[0].group
             panel.set_title(f"{title} {group}" if title in states else title)
-            _draw(panel, motion.t, found, colors if group in JOINTS else {})
+            chart_colors = colors if group in JOINTS else {}
+            _draw(panel, motion.t, chart, chart_colors)
             if motion.tracked and [title] == states[:1]:
                 panel.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
-            if group in JOINTS or len(found) > _MOST_IN_A_PANEL:
+            if group in JOINTS or len(chart) > _MOST_IN_A_PANEL:
                 # Long joint names, or many names, do not fit into a chart. Their legends are below
                 # all charts. One legend names the joints of all charts.
-                named = legends.setdefault("joints" if group in JOINTS else title, {})
+                legend = "joints" if group in JOINTS else title
+                named = legends.setdefault(legend, {})
                 named.update(zip(*panel.get_legend_handles_labels()[::-1], strict=True))
             else:
-                if many := len(found) > 3:
+                if many := len(chart) > 3:
                     panel.margins(y=0.3)  # room for the names above the curves
                 panel.legend(ncols=2 if many else 1, handlelength=1.4)
             if errors and title in states:
                 strip = figure.add_subplot(grid[row + 1, column], sharex=panel)
-                below = [errors[curve.key] for curve in found]
-                _draw(strip, motion.t, below, colors if group in JOINTS else {}, width=1.0)
-                strip.set_ylabel(f"{what}\n{strip.get_ylabel()}".strip())
-                strip.ticklabel_format(axis="y", scilimits=(-2, 3))
+                below = [errors[curve.key] for curve in chart]
+                _draw_errors(strip, motion.t, below, chart_colors, error_label)
                 panel.tick_params(labelbottom=False)
                 panel.set_xlabel("")
         _name_below(figure, legends)
         starts, rest = motion.starts[1:].tolist(), resting_from(motion)
-        for panel, mark in product(figure.axes, starts if rest is None else [rest]):
+        marks = starts if rest is None else [rest]
+        for panel, mark in product(figure.axes, marks):
             panel.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
         _draw_drifts(figure.add_subplot(grid[spots[-1]]), motion)
         for panel in figure.axes:
             panel.margins(x=0.0)
-        head = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
-        head += ["solid: nonlinear, dashed: linear"] * (motion.linear is not None)
-        phases = zip(motion.phases[1:], starts, strict=True)
-        head += [f"{name} at {start:g} s" for name, start in phases]
-        figure.suptitle(f"{'; '.join(head)}\n{motion.stopped}".strip(), fontsize=11)
+        figure.suptitle(_heading(motion), fontsize=11)
     return figure
+
+
+def _heading(motion: Motion) -> str:
+    """Return the heading of the figure of a motion."""
+    parts = [f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"]
+    if motion.linear is not None:
+        parts.append("solid: nonlinear, dashed: linear")
+    phases = zip(motion.phases[1:], motion.starts[1:].tolist(), strict=True)
+    parts += [f"{name} at {start:g} s" for name, start in phases]
+    return f"{'; '.join(parts)}\n{motion.stopped}".strip()
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
@@ -164,12 +173,12 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
     if not (show is None or isinstance(show, Sequence)):
         raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
     keys = names if show is None else [names[i] for i in chosen("state or input", show, names)]
-    found: dict[str, list[Curve]] = {title: [] for title in _TITLES.values()}
+    curves_of_title: dict[str, list[Curve]] = {title: [] for title in _TITLES.values()}
     for curve in curves(motion):
         if curve.key in keys:
             title = _TITLES.get((curve.group, curve.unit), f"{curve.group} in {curve.unit}")
-            found.setdefault(title, []).append(curve)
-    return {title: each for title, each in found.items() if each}
+            curves_of_title.setdefault(title, []).append(curve)
+    return {title: chart for title, chart in curves_of_title.items() if chart}
 
 
 def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
@@ -181,55 +190,69 @@ def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     """
     names = motion.state_names
     units = motion.state_units
-    what = "error"
+    label = "error"
     if motion.tracked and (e := motion.error) is not None:
         units = ("deg",) * 3 + units[3:]
         sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
         e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
     elif motion.linear is not None:
-        what = "difference"
+        label = "difference"
         e = motion.x - motion.linear
     else:
-        return what, {}
-    of, none = zip(names, units, e.T, strict=True), np.zeros(0)
-    return what, {name: Curve(name, "", name, unit, x, none) for name, unit, x in of}
+        return label, {}
+    columns, none = zip(names, units, e.T, strict=True), np.zeros(0)
+    return label, {name: Curve(name, "", name, unit, x, none) for name, unit, x in columns}
 
 
 def _draw(
     axes: Axes,
     t: Array,
-    found: Sequence[Curve],
+    chart: Sequence[Curve],
     colors: Mapping[str, str],
     width: float | None = None,
 ) -> None:
     """Draw curves and their limits, with references in pale colours and predictions dashed."""
-    group, unit = found[0].group, found[0].unit
+    group, unit = chart[0].group, chart[0].unit
     # At 180 degrees, the quaternion changes its sign, so attitude curves jump. Leave a gap there.
-    for field in ("values", "linear", "reference") if group == "q_b" else ():
-        if getattr(found[0], field) is not None:
-            rows = np.array([getattr(each, field) for each in found])
+    jumping = ("values", "linear", "reference") if group == "q_b" else ()
+    for field in jumping:
+        if getattr(chart[0], field) is not None:
+            rows = np.array([getattr(curve, field) for curve in chart])
             rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
-            found = [c._replace(**{field: row}) for c, row in zip(found, rows, strict=True)]
+            chart = [c._replace(**{field: row}) for c, row in zip(chart, rows, strict=True)]
     steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
-    for own, curve in zip(cycle(len(found)), found, strict=True):
-        color = colors.get(curve.short, own)
+    for default_color, curve in zip(cycle(len(chart)), chart, strict=True):
+        color = colors.get(curve.short, default_color)
         if curve.reference is not None:
             axes.plot(t, curve.reference, color=color, lw=3.6, alpha=0.3)
         axes.plot(t, curve.values, color=color, label=curve.short, drawstyle=steps, lw=width)
         if curve.linear is not None:
             axes.plot(t, curve.linear, color=color, ls="--", lw=1.0)
-    levels = sorted({level for curve in found for level in curve.near})
+    levels = sorted({level for curve in chart for level in curve.near})
     for level in levels:
         label = "limit" if level == levels[-1] else "_limit"
         axes.axhline(level, ls="--", lw=0.9, color="#555555", label=label)
-    axes.set(xlabel="t [s]", ylabel="" if unit == "1" else f"[{unit}]")
+    label = "" if unit == "1" else f"[{unit}]"
+    axes.set(xlabel="t [s]", ylabel=label)
+
+
+def _draw_errors(
+    axes: Axes, t: Array, errors: Sequence[Curve], colors: Mapping[str, str], label: str
+) -> None:
+    """Draw the errors of a chart of states, which is above these axes."""
+    _draw(axes, t, errors, colors, width=1.0)
+    axes.set_ylabel(f"{label}\n{axes.get_ylabel()}".strip())
+    axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
 def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> None:
     """Add legends below all charts, with as many columns as fit."""
     for title, named in legends.items():
-        side = "center" if len(legends) == 1 else "left" if title == "joints" else "right"
-        letters = 150 if side == "center" else 75
+        letters = 75
+        side = "left" if title == "joints" else "right"
+        if len(legends) == 1:
+            letters = 150
+            side = "center"
         columns = min(len(named), 8, max(1, letters // (max(map(len, named)) + 6)))
         names = sorted(named, key="limit".__eq__)  # the limit last
         lines = [named[name] for name in names]

@@ -107,8 +107,10 @@ def curves(motion: Motion) -> Iterator[Curve]:
     for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
         group, _, entry = name.partition(".")
         wheel = group in _OF_MODES and entry in motion.wheels
-        kinds = [("speed", unit, 1.0), ("momentum", "N m s", inertias.get(entry, 0.0))]
-        for kind, of_kind, size in kinds if wheel else [(group, unit, 1.0)]:
+        kinds = [(group, unit, 1.0)]
+        if wheel:
+            kinds = [("speed", unit, 1.0), ("momentum", "N m s", inertias.get(entry, 0.0))]
+        for kind, of_kind, size in kinds:
             if size and not (wheel and group == "q_m"):
                 bounds, values = size * limits.get(name, unlimited), size * motion.x[:, i]
                 linear = None if motion.linear is None else size * motion.linear[:, i]
@@ -125,7 +127,9 @@ def curves(motion: Motion) -> Iterator[Curve]:
 def group_of_input(motion: Motion, key: str) -> str:
     """Return the group of an input GROUP.NAME, which is "wheel" for the motor of any wheel."""
     group, _, name = key.partition(".")
-    return "wheel" if group == "tau_m" and name in motion.wheels else group
+    if group == "tau_m" and name in motion.wheels:
+        return "wheel"
+    return group
 
 
 class Passed(NamedTuple):
@@ -140,8 +144,10 @@ class Passed(NamedTuple):
 
     def __str__(self) -> str:
         value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
-        said = f"{_name(self.name)} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
-        return f"{said}, from the start" if self.at_first else said
+        text = f"{_name(self.name)} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
+        if self.at_first:
+            text += ", from the start"
+        return text
 
 
 class Saturated(NamedTuple):
@@ -157,10 +163,10 @@ class Saturated(NamedTuple):
         return f"{_name(self.name)} at its limit of {size} for {_percent(self.share)} % of the run"
 
 
-def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
+def passed(t: Array, signals: Iterable[Curve]) -> tuple[Passed, ...]:
     """Return the limit violations, largest relative violation first."""
     worst = []
-    for curve in found:
+    for curve in signals:
         if curve.group == "momentum" or not curve.levels:
             continue
         size, (low, high) = max(map(abs, curve.levels)), curve.limits
@@ -170,14 +176,14 @@ def passed(t: Array, found: Iterable[Curve]) -> tuple[Passed, ...]:
         if beyond[at]:
             value = float(curve.values[at])
             first = curve.group == "q_m" and bool(beyond[0])
-            limit = float(high if value > high else low)
-            one = Passed(curve.name, value, float(t[at]), limit, curve.unit, first)
+            limit = high if value > high else low
+            one = Passed(curve.name, value, float(t[at]), float(limit), curve.unit, first)
             worst.append((-excess[at] / (size or 1e-12), one))
     return tuple(one for _, one in sorted(worst))
 
 
 def saturated(
-    t: Array, found: Iterable[Curve], pulsed: Collection[str] = ()
+    t: Array, signals: Iterable[Curve], pulsed: Collection[str] = ()
 ) -> tuple[Saturated, ...]:
     """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first.
 
@@ -185,17 +191,19 @@ def saturated(
     saturation.
     """
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
-    for curve in found:
+    for curve in signals:
         # Inputs are clipped exactly at their limits. Wheel speeds only approach their limits, and
         # therefore need a larger margin.
         margin = 1e-3 if curve.group == "speed" else 1e-9
         enforced = curve.group not in (*STATES, "momentum") and curve.name not in pulsed
-        for limit in curve.levels if enforced else ():
+        if not enforced:
+            continue
+        for limit in curve.levels:
             spent = held[np.abs(curve.values - limit) <= margin * abs(limit)]
             if limit and spent.any():
                 share = float(spent.sum() / held.sum())
                 full.append(Saturated(curve.name, limit, curve.unit, share))
-    return tuple(sorted(full, key=lambda each: -each.share))
+    return tuple(sorted(full, key=lambda item: -item.share))
 
 
 class Firings(NamedTuple):
@@ -206,12 +214,12 @@ class Firings(NamedTuple):
     propellant: float | None  # [kg]; None if a thruster that fires has no specific impulse
 
     def __str__(self) -> str:
-        said = f"thrusters: impulse {_shown(self.impulse)} N s"
+        text = f"thrusters: impulse {_shown(self.impulse)} N s"
         if self.pulses:
-            said += f" in {self.pulses} pulses"
+            text += f" in {self.pulses} pulses"
         if self.propellant is not None:
-            said += f", propellant {_shown(self.propellant)} kg"
-        return said
+            text += f", propellant {_shown(self.propellant)} kg"
+        return text
 
 
 def firings(motion: Motion) -> Firings | None:
@@ -234,10 +242,15 @@ def firings(motion: Motion) -> Firings | None:
     on = thrusts[:, pulsed] > 0.0
     starts = np.count_nonzero(on[1:] & ~on[:-1]) + np.count_nonzero(on[:1])
     every = not motion.step or bool((held <= 1.5 * motion.step).all())
-    exhaust = [_GRAVITY * (thrusters[x].isp or 0.0) if x in thrusters else 0.0 for x in names]
+    exhaust = []
+    for name in names:
+        specific_impulse = thrusters[name].isp if name in thrusters else None
+        exhaust.append(_GRAVITY * (specific_impulse or 0.0))
     fired = impulses > 0.0
     speeds = np.array(exhaust)[fired]
-    propellant = float((impulses[fired] / speeds).sum()) if len(speeds) and speeds.all() else None
+    propellant = None
+    if len(speeds) and speeds.all():
+        propellant = float((impulses[fired] / speeds).sum())
     pulses = int(starts) if every and any(pulsed) else None
     return Firings(pulses, float(impulses.sum()), propellant)
 
@@ -257,15 +270,21 @@ def pulse_thrusters(motion: Motion) -> frozenset[str]:
 
 def _name(name: str) -> str:
     group, _, entry = name.partition(".")
-    return entry if group in _OF_MODES else name
+    if group in _OF_MODES:
+        return entry
+    return name
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g}" if share < 0.1 else f"{100.0 * share:.0f}"
+    if share < 0.1:
+        return f"{100.0 * share:.2g}"
+    return f"{100.0 * share:.0f}"
 
 
 def _shown(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"
+    if abs(value) < 1000.0:
+        return f"{value:.3g}"
+    return f"{value:.0f}"
 
 
 def settled_at(sizes: Array) -> Indices:
@@ -324,7 +343,7 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
         return []
     steered = set(motion.steered or motion.state_names)
     sizes = np.abs(motion.error)
-    found = []
+    errors = []
     kinds: dict[tuple[str, str], list[int]] = {}
     for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
         group, _, entry = name.partition(".")
@@ -335,16 +354,17 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
             title = "wheel speeds"
         if group in _OF_MODES and entry in motion.modes:
             title = _OF_MODES[group][not unit.startswith(_MODAL)]
-        kinds.setdefault((title, "deg" if group == "q_b" else unit), []).append(i)
-    for (title, unit), of in kinds.items():
-        size = motion.attitude_error if title == "attitude" else sizes[:, of].max(axis=1)
-        fed_back = any(motion.state_names[i] in steered for i in of)
+        shown_unit = "deg" if group == "q_b" else unit
+        kinds.setdefault((title, shown_unit), []).append(i)
+    for (title, unit), indices in kinds.items():
+        size = motion.attitude_error if title == "attitude" else sizes[:, indices].max(axis=1)
+        fed_back = any(motion.state_names[i] in steered for i in indices)
         fed_back &= title not in ("position", "v_b") or pushed(motion)
         at = int(settled_at(size))
         settled = None if is_late(at, len(size)) else motion.t[at]
         sizes_of_kind = size[0], size.max(), size[-1]
-        found.append(ErrorSize(title, unit, *sizes_of_kind, settled, fed_back, _tail(size)))
-    return found
+        errors.append(ErrorSize(title, unit, *sizes_of_kind, settled, fed_back, _tail(size)))
+    return errors
 
 
 def _tail(size: Array) -> str:
@@ -358,24 +378,20 @@ def _tail(size: Array) -> str:
         return ""
     if last.max() > _GROWS * before and last.min() >= before:
         return "grows"
-    return "remains" if last.max() * _GROWS > before else ""
+    if last.max() * _GROWS > before:
+        return "remains"
+    return ""
 
 
-def pushed(of: object) -> bool:
+def pushed(model: object) -> bool:
     """Return whether a motion or actuation has inputs that exert a force on the base."""
-    return not {"F_b", "thrust"}.isdisjoint(map(group_of, input_keys(of)))
+    return not {"F_b", "thrust"}.isdisjoint(map(group_of, input_keys(model)))
 
 
 def motion_report(motion: Motion) -> str:
     """Return a text about settling, inputs, limit violations and conserved quantities."""
     kinds = error_sizes(motion)
-    t = motion.t
-    heads = [verdict(motion, kinds) if kinds or motion.stopped else "", _fast_wheels(motion)]
-    head = ["; ".join(filter(None, heads))] if any(heads) else []
-    by = ", compiled" if motion.engine == "compiled" else ""
-    steps = f" in steps of {motion.step:.3g} s" if motion.step else ""
-    head.append(f"{motion.robot}: {t[-1]:g} s{steps}, {len(t)} rows, frame {motion.frame}{by}")
-    parts = [folded([*head, *([str(motion.orbit)] if motion.orbit else []), *motion.notes])]
+    parts = [folded(_heading(motion, kinds))]
     if kinds:
         rows = [["error", "unit", "initial", "largest", "final"]]
         rows[0].append(f"settles to {100.0 * SETTLED:g} % at [s]")
@@ -390,12 +406,17 @@ def motion_report(motion: Motion) -> str:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
-    said = [*(f"limit exceeded: {each}" for each in motion.passed), *map(str, motion.saturated)]
+    limit_messages = [
+        *(f"limit exceeded: {violation}" for violation in motion.passed),
+        *map(str, motion.saturated),
+    ]
     if fired := firings(motion):
         parts.append(folded([str(fired)]))
-    if said:
-        more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
-        parts.append(folded(said[:_MOST] + more))
+    if limit_messages:
+        shown_messages = limit_messages[:_MOST]
+        if len(limit_messages) > _MOST:
+            shown_messages.append(f"and {len(limit_messages) - _MOST} more")
+        parts.append(folded(shown_messages))
     if motion.phases:
         parts += [f"\n{grid(_phases(motion), 'll')}", _OF_PHASES, ""]
     first, last = motion.energy[[0, -1]]
@@ -416,18 +437,46 @@ def motion_report(motion: Motion) -> str:
     return "\n".join(parts)
 
 
+def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:
+    """Return the first lines of the report: the verdict, the run, the orbit and the notes."""
+    results = []
+    if kinds or motion.stopped:
+        results.append(verdict(motion, kinds))
+    if fast := _fast_wheels(motion):
+        results.append(fast)
+    lines = []
+    if results:
+        lines.append("; ".join(results))
+    t = motion.t
+    run = f"{motion.robot}: {t[-1]:g} s"
+    if motion.step:
+        run += f" in steps of {motion.step:.3g} s"
+    run += f", {len(t)} rows, frame {motion.frame}"
+    if motion.engine == "compiled":
+        run += ", compiled"
+    lines.append(run)
+    if motion.orbit:
+        lines.append(str(motion.orbit))
+    return [*lines, *motion.notes]
+
+
 def motion_record(motion: Motion) -> dict[str, object]:
     """Return the values of the report as {name: value}, for --json."""
     t = motion.t
-    own = ["stopped", "frame", "engine", "step", "saturated", "notes"]
-    own += ["state_names", "state_units", "input_names", "input_units"]
+    copied = ["stopped", "frame", "engine", "step", "saturated", "notes"]
+    copied += ["state_names", "state_units", "input_names", "input_units"]
     errors = error_sizes(motion)
     # The errors of revolute and of prismatic joints have the same title but different units. For a
     # robot with both kinds of joints, the unit is added to the title.
-    count = Counter(each.title for each in errors)
-    keys = [f"{x.title} [{x.unit}]" if count[x.title] > 1 else x.title for x in errors]
+    count = Counter(error.title for error in errors)
+    keys = []
+    for error in errors:
+        key = error.title
+        if count[key] > 1:
+            key += f" [{error.unit}]"
+        keys.append(key)
     return {
-        **{name: getattr(motion, name) for name in own},
+        **{name: getattr(motion, name) for name in copied},
         "duration": t[-1],
         "rows": len(t),
         "errors": dict(zip(keys, errors, strict=True)),
@@ -479,46 +528,54 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     moved = [kind for kind in judged if kind.largest > THERE]
     aside = [kind.last for kind in places if kind.settled is None and not kind.steered]
     if motion.tracked and not motion.phases:
-        said = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
+        text = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.settled is None]:
-        said = f"not settled: {_and(failed)} off target"
+        text = f"not settled: {_and(failed)} off target"
     elif moved:
         when = max(kind.settled or 0.0 for kind in moved)
         band = [f"{SETTLED * kind.largest:.2g}\u00a0{kind.unit} ({kind.title})" for kind in moved]
-        said = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
+        text = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
         if late := [kind.last for kind in kinds if kind.settled is None and kind.steered]:
-            what = "positions" if judged[0].title in _PLACES else "rates"
-            said = f"{what} {said}; not yet settled: {_and(late)}"
-        for tail, what in (("remains", "remaining"), ("grows", "drifting")):
+            subject = "positions" if judged[0].title in _PLACES else "rates"
+            text = f"{subject} {text}; not yet settled: {_and(late)}"
+        for tail, trend in (("remains", "remaining"), ("grows", "drifting")):
             if left := [kind.last for kind in moved if kind.tail == tail]:
-                said += f"; {what}: {_and(left)}"
+                text += f"; {trend}: {_and(left)}"
     else:
-        which = f"{_and([kind.title for kind in judged])} " * bool(aside)
-        said = f"settled: {which}at the target throughout the run"
+        text = "settled: "
+        if aside:
+            text += f"{_and([kind.title for kind in judged])} "
+        text += "at the target throughout the run"
     if aside:
-        said += f"; not controlled: {_and(aside)}"
+        text += f"; not controlled: {_and(aside)}"
     shares: dict[str, float] = {}  # fraction of the run at the lower or upper limit
-    for each in motion.saturated:
-        shares[each.name] = shares.get(each.name, 0.0) + each.share
+    for item in motion.saturated:
+        shares[item.name] = shares.get(item.name, 0.0) + item.share
     full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
-    more = [f"{len(full) - _NAMED} more"] if len(full) > _NAMED else []
-    return f"{said}; saturated inputs: {', '.join(full[:_NAMED] + more) or 'none'}"
+    listed = full[:_NAMED]
+    if len(full) > _NAMED:
+        listed.append(f"{len(full) - _NAMED} more")
+    return f"{text}; saturated inputs: {', '.join(listed) or 'none'}"
 
 
 def _fast_wheels(motion: Motion) -> str:
     """Return a line about the wheels that exceed their largest speeds, or an empty text."""
     speeds = {f"qdot_m.{name}" for name in motion.wheels}
     fast = [
-        f"{_name(each.name)}\u00a0{_shown(each.value)}\u00a0{each.unit} "
-        f"(limit\u00a0{_shown(each.limit)})"
-        for each in motion.passed
-        if each.name in speeds
+        f"{_name(violation.name)}\u00a0{_shown(violation.value)}\u00a0{violation.unit} "
+        f"(limit\u00a0{_shown(violation.limit)})"
+        for violation in motion.passed
+        if violation.name in speeds
     ]
-    return f"wheel speed limit exceeded: {_and(fast)}" if fast else ""
+    if not fast:
+        return ""
+    return f"wheel speed limit exceeded: {_and(fast)}"
 
 
 def _and(words: list[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+    if len(words) > 1:
+        words = [", ".join(words[:-1]), words[-1]]
+    return " and ".join(words)
 
 
 def _largest_modes(motion: Motion) -> str:
@@ -536,12 +593,12 @@ def _largest_modes(motion: Motion) -> str:
     table = f"{grid(rows, 'll')}\n"
     if not far:
         return table
-    said = (
+    warning = (
         "warning: the motion is not accurate, because the model is linear in the modal "
         f"amplitudes, but some amplitudes bend the structure by more than {_LINEAR:g} deg: "
         f"{_and(far)}"
     )
-    return f"{table}\n{folded([said])}"
+    return f"{table}\n{folded([warning])}"
 
 
 def _largest_inputs(motion: Motion) -> str:

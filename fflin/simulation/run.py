@@ -133,11 +133,15 @@ class Plant(Aba):
             within = min(max(t, begin * ROUNDED_UP), (begin + h) * ROUNDED_DOWN)
             disturbed = self.disturbing(within, q, v)
         rate = self.acceleration(q, v, u, disturbed)
-        push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
+        push = force[_LINEAR_FIRST]
+        if disturbed is not None:
+            push = push + disturbed[:6]
         if self.field:
             nu = self.state.velocities(v)
             power = nu.dot(force) - self.robot.springs.damping.dot(nu[6:] ** 2)
-            push = np.append(power if disturbed is None else power + v.dot(disturbed), np.zeros(5))
+            if disturbed is not None:
+                power = power + v.dot(disturbed)
+            push = np.append(power, np.zeros(5))
         return rate, push
 
     def disturbing(self, t: float, q: Array, v: Array) -> Array:
@@ -168,19 +172,19 @@ class Plant(Aba):
         names = tuple(forces_of(self.robot))
         total, single = np.zeros(len(names)), dict[str, float]()
         for key, value in forces.items():
-            what = f"disturbance '{key}'"
+            label = f"disturbance '{key}'"
             if callable(value):
                 raise InputError(
-                    f"{what} is a function, expected a number; for a disturbance that changes in "
+                    f"{label} is a function, expected a number; for a disturbance that changes in "
                     f"time, give a function of (t, q, v) that returns {{'{key}': number}}"
                 )
-            if key in ("tau_b", "F_b") and dimension(what, value):
+            if key in ("tau_b", "F_b") and dimension(label, value):
                 rows = ANGULAR if key == "tau_b" else LINEAR
-                total[rows] = vector(what, value, 3, "the components x, y and z")
+                total[rows] = vector(label, value, 3, "the components x, y and z")
             else:
-                single[key] = number(what, value)
-        for index, each in by_name("generalised force", single, names).items():
-            total[index] = each
+                single[key] = number(label, value)
+        for index, force in by_name("generalised force", single, names).items():
+            total[index] = force
         R = self.state.rotation(q)
         for rows in self.state.in_reference:
             total[rows] = total[rows] @ R
@@ -227,7 +231,9 @@ class Conserved:
         self._start = np.concatenate((start, np.zeros(4)))
         self._x, self._y, self._z = start.tolist()  # numbers are faster than arrays
         self._root = robot.model.jointPlacements[ROOT]
-        self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
+        self._weight: Array | None = None
+        if any(robot.gravity):
+            self._weight = robot.mass * np.array(robot.gravity)
         self._free = self._root.isIdentity(0.0)
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
@@ -257,7 +263,9 @@ class Conserved:
         if self._field:
             return push
         base = _placement(q[:7] - self._start)
-        total: Array = (base if self._free else self._root * base).toDualActionMatrix().dot(push)
+        if not self._free:
+            base = self._root * base
+        total: Array = base.toDualActionMatrix().dot(push)
         if self._weight is not None:
             near = q.copy()
             near[:7] -= self._start
@@ -300,7 +308,9 @@ class Conserved:
         # The upper right 3 x 3 block of M_bb is -m [c_b]x.
         position = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
         base.translation = position
-        x, y, z = (position if self._free else self._root.actInv(position)).tolist()
+        if not self._free:
+            position = self._root.actInv(position)
+        x, y, z = position.tolist()
         q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z
         lack: Array = momentum.dot(base.toActionMatrix()) - self._M.dot(v)
         v_b = v[:6]
@@ -443,7 +453,10 @@ def go(plan: Plan, hint: str = "") -> Recording:
         nonlocal stages
         # At the first stage of a step, `u` already contains the inputs. At later stages, the inputs
         # of a continuous policy are computed again.
-        a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
+        inputs = u
+        if ask and stages:
+            inputs = ask(min(t, last), q, v)
+        a, push = stage(t, q, v, inputs)
         if pushed:
             kept.wrenches[stages][:] = kept.wrench(q, push)
         stages += 1
@@ -537,4 +550,6 @@ def stop_of(message: str) -> int:
     for index, start in enumerate(STOPS):
         if start and message.startswith(start):
             return index
-    return len(STOPS) - 1 if message else 0
+    if message:
+        return len(STOPS) - 1
+    return 0

@@ -252,14 +252,20 @@ def simulate(
     )
     foresees = predictor(plan)
     compiled = engine_of(engine, plan) == "compiled"
-    hint = "" if compiled or not_compilable(plan) else "(faster: --engine compiled) "
+    hint = ""
+    if not compiled and not not_compilable(plan):
+        hint = "(faster: --engine compiled) "
     began = perf_counter()
     try:
         run = recorded(plan) if compiled else go(plan, hint)
         if hint and (spent := perf_counter() - began) > LONG_RUN:
-            once = "" if is_kept("loop", "advance") else f", and {_COMPILING:g} s once to compile"
-            said = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
-            _log.warning(f"fflin: {said} would take about %.0f s%s", spent, _FRACTION * spent, once)
+            once = ""
+            if not is_kept("loop", "advance"):
+                once = f", and {_COMPILING:g} s once to compile"
+            message = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
+            _log.warning(
+                f"fflin: {message} would take about %.0f s%s", spent, _FRACTION * spent, once
+            )
         return motion_of(plan, run, foresees)
     except MemoryError:
         raise InputError(
@@ -291,7 +297,15 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     notes = plan.policy.notes if plan.policy else ()
     if plan.law and isinstance(plan.law.policy, BoundLaw):
         notes += plan.law.policy.notes
+    loop_notes: tuple[str, ...] = ()
+    if plan.policy:
+        loop_notes = plan.policy.loop_notes(plan.times.sample * plan.times.dt)
     limits = limits_of(plan.options.robot) | plan.acting
+    # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
+    # inputs and disturbances.
+    com_drift = np.linalg.norm(center - run.center, axis=1)
+    if robot.orbit:
+        com_drift = com_drift[:0]
     missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
     drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
     return Motion(
@@ -308,9 +322,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         energy=energy,
         momentum=np.roll(momentum, 3, axis=1),
         momentum_drift=drift.max(axis=1),
-        # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
-        # inputs and disturbances.
-        com_drift=np.linalg.norm(center - run.center, axis=1)[: 0 if robot.orbit else None],
+        com_drift=com_drift,
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
@@ -327,7 +339,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         mode_rotations=np.array([*map(attrgetter("rotation"), robot.modes)]),
         steered=plan.steered,
         notes=(
-            *(plan.policy.loop_notes(plan.times.sample * plan.times.dt) if plan.policy else ()),
+            *loop_notes,
             *plan.times.notes,
             *_energy_note(plan, run, energy, float(scale[0])),
             *dict.fromkeys(notes),
@@ -350,7 +362,8 @@ def _energy_note(plan: Plan, run: Recording, energy: Array, scale: float) -> Ite
         return
     kinetic = scale**2 / (2.0 * robot.mass)
     change = float(np.abs(energy - energy[0]).max()) / kinetic
-    if change > (_ENERGY_OF_SPRINGS if robot.springs.stiffness.any() else _ENERGY):
+    tolerance = _ENERGY_OF_SPRINGS if robot.springs.stiffness.any() else _ENERGY
+    if change > tolerance:
         yield (
             f"the energy changes by {100.0 * change:.2g} % of its largest kinetic part, although "
             "no force does work, so the motion is not accurate; give a smaller dt"
@@ -371,7 +384,9 @@ def past_half_turn(run: Recording, reference: Array) -> float | None:
     # The scalar part of the quaternion from the reference to the base changes its sign at 180 deg.
     negative = (run.q[:, 3:7] * reference).sum(axis=1) < 0.0
     rows = np.flatnonzero(negative != negative[0])
-    return float(run.t[rows[0]]) if len(rows) else None
+    if not len(rows):
+        return None
+    return float(run.t[rows[0]])
 
 
 def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> list[str]:
@@ -393,8 +408,8 @@ def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> lis
         clauses.append("the linear prediction is omitted, because it does not hold there")
     if not clauses:
         return []
-    what = "reference" if plan.follows is None else "trajectory"
-    at = f"the base rotated past 180 deg from the {what} at t = {beyond:g} s"
+    origin = "reference" if plan.follows is None else "trajectory"
+    at = f"the base rotated past 180 deg from the {origin} at t = {beyond:g} s"
     return [f"{at}; {'; '.join(clauses)}"]
 
 
@@ -428,9 +443,10 @@ def predictor(plan: Plan) -> Predictor | None:
             return predicted
     if linear is None:
         return None
+    kind = policy.kind if policy else None
     raise InputError(
         "linear= is given, but this model cannot predict a motion with a policy of type "
-        f"{policy.kind if policy else None}; leave linear= out, or give the full model of a "
+        f"{kind}; leave linear= out, or give the full model of a "
         "StateFeedback, an OutputFeedback, a LinearController or no policy"
     )
 
@@ -446,8 +462,9 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if lin is None:  # a discrete-time model without its continuous-time model
         return x[:0]
     x0, u0 = lin.x0, lin.u0
-    of = plan.plant.state.nx // 2 + plan.limits.wheels.row  # indices of limited wheel speeds in x
-    applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[of])
+    # Indices in x of the wheel speeds that have limits.
+    wheel_rows = plan.plant.state.nx // 2 + plan.limits.wheels.row
+    applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[wheel_rows])
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 
@@ -468,14 +485,14 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
         size = _SMALL if cuts else 1.0
         A = np.column_stack([(rate(size * unit) - f0[:, 0]) / size for unit in np.eye(len(e))])
     if cuts:
-        fastest = max(np.abs(np.linalg.eigvals(each)).max(initial=0.0) for each in (A, lin.A))
+        fastest = max(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0) for matrix in (A, lin.A))
         parts = math.ceil(max(1.0, fastest * dt / _PART))
     A, forced = held_exponential(A, np.hstack((B, f0)), dt)
     B, f0 = forced[:, :-1], forced[:, -1]
     if not (sample or cuts):
-        found = _affine_motion(A, f0, e, steps, every)[: len(x)]
-        if len(found) == len(x) and np.isfinite(found).all():
-            return (found + x0)[:, : x.shape[1]]
+        states = _affine_motion(A, f0, e, steps, every)[: len(x)]
+        if len(states) == len(x) and np.isfinite(states).all():
+            return (states + x0)[:, : x.shape[1]]
         # A power of A may overflow although no state does, so the steps are then made one by one.
     for step in range(steps):
         u = applied(step, e) if sample else u0
@@ -486,8 +503,10 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
                 e = _runge_kutta(rate, e, dt / parts)
         else:
             e = A.dot(e) + B.dot(u - u0) + f0
-    found = (np.array([*rows, e]) + x0)[: len(x), : x.shape[1]]
-    return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
+    states = (np.array([*rows, e]) + x0)[: len(x), : x.shape[1]]
+    if len(states) == len(x) and np.isfinite(states).all():
+        return states
+    return x[:0]
 
 
 def _affine_motion(A: Array, f0: Array, e: Array, steps: int, every: int) -> Array:

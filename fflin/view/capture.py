@@ -49,13 +49,13 @@ _GIF_FPS, _GIF_FRAMES = 12, 96
 
 def find_chromium() -> str:
     """Return the path of an installed Chromium, or raise `MissingPackageError`."""
-    found = next(filter(None, map(shutil.which, _NAMES)), None)
-    if found is None:
+    program = next(filter(None, map(shutil.which, _NAMES)), None)
+    if program is None:
         raise MissingPackageError(
             "Chromium, which takes the pictures, is not found; install it (Debian: apt install "
             "chromium), or open the HTML file in a browser and take screenshots"
         )
-    return found
+    return program
 
 
 def take_png(page: str, times: Sequence[float]) -> bytes:
@@ -130,18 +130,23 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
     After `patience` seconds, the browser is killed.
     """
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
-        root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
-        command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
+        options = [*_ARGUMENTS]
+        if getattr(os, "geteuid", lambda: 1)() == 0:
+            options.append("--no-sandbox")
+        command = [program, *options, f"--user-data-dir={folder}", "about:blank"]
+        # Temporary files of the browser go into `folder`, which is removed at the end. One of these
+        # files is a socket, whose path may have at most about 100 characters. So if the path of
+        # `folder` is long, the browser uses the default folder for temporary files.
+        environment = {**os.environ}
+        if len(folder) < 56:
+            environment["TMPDIR"] = folder
         process = subprocess.Popen(
             ["sh", "-c", _WITH_PIPES, *command],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # Temporary files of the browser go into `folder`, which is removed at the end. One of
-            # these files is a socket, whose path may have at most about 100 characters. So if the
-            # path of `folder` is long, the browser uses the default folder for temporary files.
-            env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
+            env=environment,
             start_new_session=True,
         )
         timer = threading.Timer(patience, _kill, [process])

@@ -198,14 +198,16 @@ class Live:
 
 def _ranges(robot: Robot) -> dict[str, tuple[float, float]]:
     """Return {joint: range of the slider [rad|m|kg^0.5 m]} for all joints except wheels."""
-    found = {}
+    ranges = {}
     for joint in robot.joints:
         most = 1.0 if joint.prismatic else np.pi
         least, largest = travel_of(robot.model, joint)
         low, high = max(least, -most), min(largest, most)
+        if not low < high:
+            low, high = low - 1.0, low + 1.0
         if joint.name not in robot.wheels:
-            found[joint.name] = (low, high) if low < high else (low - 1.0, low + 1.0)
-    return found
+            ranges[joint.name] = (low, high)
+    return ranges
 
 
 class _Guarded(RequestHandler):
@@ -268,7 +270,9 @@ class _Socket(_Guarded, WebSocketHandler):
 
     def update(self) -> None:
         self._behind = self._busy
-        sent = None if self._busy else self.send(self._live._state)
+        if self._busy:
+            return
+        sent = self.send(self._live._state)
         if sent:
             self._busy = True
             sent.add_done_callback(self._arrived)

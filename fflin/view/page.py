@@ -95,14 +95,15 @@ def body_poses(robot: Robot, q: Array) -> Array:
     appendage is an exception: its pose is the pose of the appendage's frame after bending.
     """
     data = robot.model.createData()
-    found = []
+    all_poses = []
     for row in q.reshape(-1, robot.nq):
         pin.forwardKinematics(robot.model, data, row)
         poses = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]]
-        for bending in bendings(robot).values() if robot.appendages else ():
-            poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, row))
-        found.append(poses)
-    return np.array(found).reshape(*q.shape[:-1], robot.model.njoints - ROOT, 7)
+        if robot.appendages:
+            for bending in bendings(robot).values():
+                poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, row))
+        all_poses.append(poses)
+    return np.array(all_poses).reshape(*q.shape[:-1], robot.model.njoints - ROOT, 7)
 
 
 class Drawing:
@@ -119,11 +120,11 @@ class Drawing:
         self._visualizer = page.meshcat[node]
         # Name of each body's node, in the order of Pinocchio's joints (without the universe).
         self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
-        found, notes = shapes(robot)
+        drawn_shapes, notes = shapes(robot)
         if robot.urdf or not prefix:  # boxes are the normal drawing of a payload without a URDF
             page.notes |= dict.fromkeys(notes)
         corners: dict[int, list[Array]] = {}
-        for index, shape in enumerate(found):
+        for index, shape in enumerate(drawn_shapes):
             body = self._visualizer[self.paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
                 about: dict[str, object] = {"finish": shape.finish, "color": color, "look": look}
@@ -168,11 +169,11 @@ class Drawing:
 
     def points(self, poses: Array) -> Array:
         """Return the corners (M, 3), in the world, of the bounding boxes of all bodies."""
-        found = []
+        world_corners = []
         for joint, corners in self.corners.items():
             placement = pin.XYZQUATToSE3(poses[joint - ROOT])
-            found += [placement.act(corner) for corner in corners]
-        return np.array(found)
+            world_corners += [placement.act(corner) for corner in corners]
+        return np.array(world_corners)
 
     def _send(self, kind: str, node: Visualizer, **entries: object) -> None:
         node.window.record({"type": kind, "path": node.path.lower(), **entries})
@@ -186,7 +187,11 @@ class Drawing:
                 {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
                 {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
             ]
-            clip = {"fps": 1, "name": path, "tracks": [{**each, "times": times} for each in tracks]}
+            clip = {
+                "fps": 1,
+                "name": path,
+                "tracks": [{**track, "times": times} for track in tracks],
+            }
             clips.append({"path": self._visualizer[path].path.lower(), "clip": clip})
         return clips
 
@@ -220,29 +225,31 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
             for mesh in load_mesh(shape.mesh)
         ]
     color = shape.color or PLAIN
-    found = list[tuple[dict[str, object], Array, Color, Array]]()
+    pieces = list[tuple[dict[str, object], Array, Color, Array]]()
 
     def add(name: str, matrix: Array, half: Sequence[float], **sizes: float) -> None:
         geometry = {"uuid": name.lower(), "type": f"{name}Geometry", **sizes}
-        found.append((geometry, matrix, color, np.array([np.negative(half), half])))
+        pieces.append((geometry, matrix, color, np.array([np.negative(half), half])))
 
     if shape.kind == "box":
         width, height, depth = shape.size
         half = [side / 2.0 for side in shape.size]
         add("Box", unit, half, width=width, height=height, depth=depth)
-        return found
+        return pieces
     radius = shape.size[0]
     ends = [0.0]
     if shape.kind != "sphere":
         length = shape.size[1]
         sizes = {"radiusTop": radius, "radiusBottom": radius, "height": length}
         add("Cylinder", _Y_TO_Z, (radius, length / 2.0, radius), **sizes, radialSegments=40)
-        ends = [-length / 2.0, length / 2.0] if shape.kind == "capsule" else []
+        ends = []
+        if shape.kind == "capsule":
+            ends = [-length / 2.0, length / 2.0]
     for end in ends:
         lifted = pin.SE3(np.eye(3), np.array((0.0, 0.0, end))).homogeneous
         fineness = {"widthSegments": 32, "heightSegments": 20}
         add("Sphere", lifted, (radius, radius, radius), radius=radius, **fineness)
-    return found
+    return pieces
 
 
 def _triangles(mesh: Mesh) -> dict[str, object]:
@@ -326,9 +333,13 @@ class Recorder:
 def subtitle(robot: Robot) -> str:
     """Return the text below a robot's name on the page."""
     wheels = len(robot.wheels)
-    parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
-    orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
-    return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
+    parts = [counted(robot.n - wheels, "joint")]
+    if wheels:
+        parts.append(counted(wheels, "wheel"))
+    parts.append(f"{robot.mass:.4g} kg")
+    if robot.orbit:
+        parts.append(f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}")
+    return ", ".join(parts)
 
 
 class Page:
@@ -393,8 +404,10 @@ class Page:
         for name, wheel in named:
             joint, at = find_frame(robot.model, wheel.frame)
             axis = np.array(wheel.axis)
-            several = [each.frame for _, each in named]
-            apart = _APART * self.size * (several.count(wheel.frame) > 1)
+            frames = [item.frame for _, item in named]
+            apart = 0.0
+            if frames.count(wheel.frame) > 1:
+                apart = _APART * self.size
             placement = at * pin.SE3(turned_to(axis), apart * axis)
             # If the speed of a wheel is a state, the drawn wheel rotates with the node of the
             # wheel's joint.
@@ -402,7 +415,11 @@ class Page:
             wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
         # A live page receives the meshcat commands from the server. Other pages contain these
         # commands and open no connection.
-        live = mode == "live"
+        connect = "'self' ws:"
+        commands = list[str]()
+        if mode != "live":
+            connect = "'none'"
+            commands = [_base64(command) for command in self.window.commands()]
         digits = max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **orbit,
@@ -421,7 +438,7 @@ class Page:
             "mode": mode,
             "points": points.round(digits).tolist(),
             **entries,
-            "commands": [] if live else [_base64(each) for each in self.window.commands()],
+            "commands": commands,
         }
         # In a script element, only an end tag or the start of a comment has a special meaning. Both
         # begin with "<", which is therefore escaped.
@@ -430,7 +447,7 @@ class Page:
             "title": escape(robot.name),
             "scene": self.scene,
             "mode": mode,
-            "connect": "'self' ws:" if live else "'none'",
+            "connect": connect,
             **_fixed(),
             "data": data,
         }

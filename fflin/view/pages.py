@@ -72,7 +72,8 @@ def motion_page(
         # At the end, `states` has one row for a fixed target, one row per frame for a moving
         # target, and no row without a target.
         states = motion.target.reshape(-1, state.nx)
-        states = states[shown] if len(states) > 1 else states
+        if len(states) > 1:
+            states = states[shown]
         goal = state.points(states)[1]
     else:
         goal = target[None]
@@ -82,7 +83,8 @@ def motion_page(
     if len(goals):
         ghost = Drawing(page, robot, "target", "ghost")
         ghost.place(goals[0])
-        moving += [(ghost, goals)] if len(goals) > 1 else []
+        if len(goals) > 1:
+            moving.append((ghost, goals))
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
         moving.append((Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted)))
@@ -92,9 +94,9 @@ def motion_page(
         held.append((Drawing(page, caught.payload, f"held/{name}", "held", name), poses))
     moving += held
     clips = []
-    for each, poses in moving:
-        each.place(poses[0])
-        clips += each.tracks(t - t[0], poses)
+    for drawing, poses in moving:
+        drawing.place(poses[0])
+        clips += drawing.tracks(t - t[0], poses)
     options = {"play": True, "repetitions": 1}
     page.window.record(
         {"type": "set_animation", "animations": clips, "options": options, "path": ""}
@@ -103,11 +105,11 @@ def motion_page(
     # Robot of each phase, if known. In the phases after a capture, the robot includes the payload.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
-    names = [each.name.replace("+", " + ") for each in flown]
-    about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
+    names = [part_robot.name.replace("+", " + ") for part_robot in flown]
+    about = [f"{subtitle(part_robot)}, {t[-1] - t[0]:.4g} s" for part_robot in flown]
     corners = [frame_points(page, film)]
-    for each, rows in ((page.drawing, goals), *held):
-        corners += [each.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
+    for drawing, rows in ((page.drawing, goals), *held):
+        corners += [drawing.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
     points = np.concatenate(corners)
     page.floor[2] = float(points[:, 2].min())
     if follow is None:
@@ -115,19 +117,20 @@ def motion_page(
         follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
         points = frame_points(page, film, follow=True)
+    marked_goals = goals[:1] if motion.phases else goals
     return page.html(
         "motion",
         points,
         subtitle=about[0],
         **panel(robot, motion, shown, goal),
-        **marks(page, film, goals[:1] if motion.phases else goals),
+        **marks(page, film, marked_goals),
         t=packed(t),
         speed=speed,
         follow=follow,
         target=len(goals) > 0,
         linear=motion.linear is not None,
         phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
-        held=[each.prefix for each, _ in held],
+        held=[drawing.prefix for drawing, _ in held],
     )
 
 
@@ -179,8 +182,8 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
 
 def moved(poses: Array, point: Array) -> Array:
     """Return the world positions (N, 3) of a point (3,) fixed in a frame with poses (N, 7)."""
-    found: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
-    return found
+    positions: Array = poses[:, :3] + rotation_matrices(poses[:, 3:]) @ point
+    return positions
 
 
 class Playback(NamedTuple):
@@ -216,9 +219,8 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
     def in_world(kind: str, relative: bool) -> Array:
         if kind not in groups:
             return np.zeros((len(q), 3))
-        wrench: Array = (state.reference.rotation if relative else turned) @ u[
-            :, groups[kind], None
-        ]
+        rotation = state.reference.rotation if relative else turned
+        wrench: Array = rotation @ u[:, groups[kind], None]
         return wrench[..., 0]
 
     force, torque = in_world("F_b", state.axes[1]), in_world("tau_b", state.axes[0])
@@ -231,7 +233,8 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
     The poses are at the samples of the motion whose indices are in `shown` (N,).
     """
     parts = motion._phases
-    first = np.cumsum([0, *(len(part.t) if isinstance(part, Motion) else 0 for part in parts)])
+    counts = [len(part.t) if isinstance(part, Motion) else 0 for part in parts]
+    first = np.cumsum([0, *counts])
     for k, caught in enumerate(parts):
         if not isinstance(caught, Capture):
             continue
@@ -239,7 +242,8 @@ def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Captu
         poses = _flight(caught, frame, before)
         for part, start, end in zip(parts[k:], first[k:], first[k + 1 :], strict=False):
             rows = shown[(shown >= start) & (shown < end)] - start
-            poses += _held(caught, part._robot, part.q[rows]) if len(rows) else []
+            if len(rows):
+                poses += _held(caught, part._robot, part.q[rows])
         yield caught, np.array(poses)
 
 
@@ -288,19 +292,19 @@ def errors(
     The joints `wheels` and modes are excluded.
     """
     goals = np.broadcast_to(target, q.shape)
-    apart = np.array([pin.difference(robot.model, *each) for each in zip(goals, q, strict=True)])
+    apart = np.array([pin.difference(robot.model, *pair) for pair in zip(goals, q, strict=True)])
     joints = [joint for joint in robot.joints if not (joint.mode or joint.name in wheels)]
     turning = [joint.idx_v for joint in joints if not joint.prismatic]
     sliding = [joint.idx_v for joint in joints if joint.prismatic]
-    found = {
+    error_of = {
         "attitude": ("°", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
         "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
     if turning:
-        found["largest joint"] = ("°", np.degrees(np.abs(apart[:, turning]).max(axis=1)))
+        error_of["largest joint"] = ("°", np.degrees(np.abs(apart[:, turning]).max(axis=1)))
     if sliding:
-        found["largest prismatic joint"] = ("m", np.abs(apart[:, sliding]).max(axis=1))
-    return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
+        error_of["largest prismatic joint"] = ("m", np.abs(apart[:, sliding]).max(axis=1))
+    return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in error_of.items()}
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
@@ -309,12 +313,18 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
     from the first configuration instead of errors.
     """
-    found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1], motion.wheels)
-    of = "{} error" if len(target) else "{} change"
-    readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
+    compared = target if len(target) else motion.q[:1]
+    error_of = errors(robot, motion.q[shown], compared, motion.wheels)
+    label_form = "{} error" if len(target) else "{} change"
+    # The errors of the joints are plotted only for a moving target.
+    plotted = 4 if len(target) > 1 else 2
+    rest = resting_from(motion) if len(target) > 1 else None
+    readouts = [
+        (label_form.format(quantity), unit, values) for quantity, (unit, values) in error_of.items()
+    ]
     plots = [
         _plot(title, [Curve("", "", "", unit, values, _NONE)])
-        for title, unit, values in readouts[: 4 if len(target) > 1 else 2]
+        for title, unit, values in readouts[:plotted]
         if values.any()
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
@@ -322,16 +332,17 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     for title, whole in charts(motion).items():
         lines = []
-        for each in whole:
-            followed = each.reference if len(target) > 1 else None
-            reference = None if followed is None else followed[shown]
-            lines.append(each._replace(values=each.values[shown], reference=reference))
+        for curve in whole:
+            reference = None
+            if len(target) > 1 and curve.reference is not None:
+                reference = curve.reference[shown]
+            lines.append(curve._replace(values=curve.values[shown], reference=reference))
         least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
-        seen = [each for each in lines if _size(each) >= least]
+        seen = [curve for curve in lines if _size(curve) >= least]
         # States of the base are not plotted here, because the errors of attitude and position are
         # plotted above. Rates are plotted only if one of them comes near a limit.
         of_base = whole[0].group in STATES and whole[0].group not in JOINTS
-        if any(each.near or not title.endswith("rates") for each in seen) and not of_base:
+        if any(curve.near or not title.endswith("rates") for curve in seen) and not of_base:
             plots.append(_plot(title, seen))
     return {
         "readouts": [
@@ -339,8 +350,8 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
-        "rest": resting_from(motion) if len(target) > 1 else None,
-        "passed": [[str(each), each.time] for each in motion.passed],
+        "rest": rest,
+        "passed": [[str(violation), violation.time] for violation in motion.passed],
     }
 
 
@@ -371,10 +382,10 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
 
 
 def mode_page(
-    robot: Robot, found: Modes, scene: str, tool: str | None
+    robot: Robot, model_modes: Modes, scene: str, tool: str | None
 ) -> tuple[str, Collection[str]]:
     """Return the page of a robot's modes, and notes about visual elements that are not drawn."""
-    lin = found.lin
+    lin = model_modes.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
         raise InputError(
@@ -382,7 +393,7 @@ def mode_page(
             f"expected the {state.nx} states of '{robot.name}'; give the robot and the modes of "
             "the same unreduced model"
         )
-    if not found.vibrations:
+    if not model_modes.vibrations:
         raise InputError(
             f"'{robot.name}' has no vibration to show: no mode oscillates; give its flexible "
             "joints a stiffness"
@@ -390,9 +401,9 @@ def mode_page(
     page, at_rest = Page(robot, lin.q, scene, tool, lin.frame), body_poses(robot, lin.q)
     page.drawing.place(at_rest)
     Drawing(page, robot, "rest", "ghost").place(at_rest)
-    swings = [_swing(state, page, mode, lin) for mode in found.vibrations]
+    swings = [_swing(state, page, mode, lin) for mode in model_modes.vibrations]
     points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
-    shapes = np.array([mode.shape for mode in found.vibrations])
+    shapes = np.array([mode.shape for mode in model_modes.vibrations])
     energies = energies_of(robot, lin, shapes)
     modes = [
         {
@@ -403,7 +414,7 @@ def mode_page(
             "shape": _shape(mode, lin),
             "poses": packed(poses),
         }
-        for mode, (energy, _), poses in zip(found.vibrations, energies, swings, strict=True)
+        for mode, (energy, _), poses in zip(model_modes.vibrations, energies, swings, strict=True)
     ]
     about = f"{subtitle(robot)}, {counted(len(modes), 'vibration')}"
     corners = np.concatenate(points)
@@ -424,14 +435,17 @@ def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
 
     # Largest displacement of a corner per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    moved = np.array([page.drawing.points(each) - page.points for each in poses(small)])
+    moved = np.array([page.drawing.points(pose_rows) - page.points for pose_rows in poses(small)])
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [
         {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]
     ]
-    most = [_ANGLE / turned.max()] if turned.any() else []
-    most += [_SHARE * page.size / reach] if reach else []
-    return poses(min(most, default=0.0))
+    bounds = []
+    if turned.any():
+        bounds.append(_ANGLE / turned.max())
+    if reach:
+        bounds.append(_SHARE * page.size / reach)
+    return poses(min(bounds, default=0.0))
 
 
 def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:

@@ -63,23 +63,25 @@ class Shape:
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     """Return the shapes of a robot, and notes about visual elements that are not drawn."""
     notes: list[str] = []
-    found = list(_visuals(robot, notes)) if robot.urdf else []
-    if not found:
+    drawn = list[Shape]()
+    if robot.urdf:
+        drawn = list(_visuals(robot, notes))
+    if not drawn:
         notes.append(
             f"{robot.name}: no visual geometry; boxes with the links' inertias are drawn instead"
         )
         return tuple(_inertia_boxes(robot)), tuple(notes)
     for prefix, other in robot.attached:
-        theirs, said = shapes(other)
-        notes += said
+        theirs, their_notes = shapes(other)
+        notes += their_notes
         carriers = carriers_of(robot, prefix, other)
         for shape in theirs:
             joint, held = carriers[shape.joint - ROOT]
             placement = held * shape.placement
             link = f"{prefix}.{shape.link}"
             at = held * shape.at
-            found.append(replace(shape, joint=joint, placement=placement, link=link, at=at))
-    return tuple(found), tuple(notes)
+            drawn.append(replace(shape, joint=joint, placement=placement, link=link, at=at))
+    return tuple(drawn), tuple(notes)
 
 
 def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
@@ -114,9 +116,11 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         frame = robot.model.frames[frame_id]
         if frame.parentJoint < ROOT:
             continue
-        bending = bent.get(frame.name)
-        joint = bending.node if bending else frame.parentJoint
-        at = bending.frame.actInv(frame.placement) if bending else frame.placement
+        joint = frame.parentJoint
+        at = frame.placement
+        if bending := bent.get(frame.name):
+            joint = bending.node
+            at = bending.frame.actInv(frame.placement)
         for visual in link.find_all("visual"):
             try:
                 kind, size, mesh = _geometry(visual)
@@ -137,17 +141,26 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                     continue
             yield Shape(joint, kind, size, placement, color, finish, file, frame.name, at)
     yield from _balls(robot, bent)
+    notes += _not_drawn(robot, path, missing, unreadable, odd)
+
+
+def _not_drawn(
+    robot: Robot, path: Path, missing: list[str], unreadable: list[str], odd: list[str]
+) -> Iterator[str]:
+    """Yield notes about mesh files, and about lines of visual elements, that are not drawn."""
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
-        notes.append(
+        yield (
             f"{robot.name}: {named('mesh file', missing)} not found below {where} and not "
             "drawn; give the folders of the meshes in package_dirs of fflin.load"
         )
     if unreadable:
-        notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read and not drawn")
+        yield f"{robot.name}: {named('mesh file', unreadable)} cannot be read and not drawn"
     if odd:
-        lines = ", ".join(odd[:6]) + ", ..." * (len(odd) > 6)
-        notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
+        lines = ", ".join(odd[:6])
+        if len(odd) > 6:
+            lines += ", ..."
+        yield f"{path.name}: <visual> in line {lines} is malformed and not drawn"
 
 
 def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
@@ -160,7 +173,9 @@ def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
     if shape.tag in ("cylinder", "capsule"):
         return shape.tag, (shape.number("radius"), shape.number("length")), None
     if shape.tag == "mesh":
-        scale = shape.vector("scale", 3) if "scale" in shape.attributes else (1.0, 1.0, 1.0)
+        scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+        if "scale" in shape.attributes:
+            scale = shape.vector("scale", 3)
         return "mesh", scale, shape.text("filename")
     raise ValueError(shape.tag)
 
@@ -174,8 +189,8 @@ def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[
 
 
 def _color(material: Element) -> Color | None:
-    for found in material.find_all("color"):
-        r, g, b, a = (min(max(x, 0.0), 1.0) for x in found.vector("rgba", 4))
+    for element in material.find_all("color"):
+        r, g, b, a = (min(max(x, 0.0), 1.0) for x in element.vector("rgba", 4))
         return r, g, b, a
     return None
 
@@ -224,7 +239,7 @@ class Bending(NamedTuple):
 @lru_cache(maxsize=4)
 def bendings(robot: Robot) -> dict[str, Bending]:
     """Return {title: bending} for the flexible appendages of a robot."""
-    found = {}
+    bending_of = {}
     for item in robot.appendages:
         if isinstance(item, FlexibleAppendage):
             joints = [robot.joint(name) for name in item.modes]
@@ -237,7 +252,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
             node = robot.model.getJointId(joints[0].name)
             carrier, frame = find_frame(robot.model, item.frame)
             ball = robot.model.jointPlacements[node] * robot.model.inertias[node].lever
-            found[item.title] = Bending(
+            bending_of[item.title] = Bending(
                 node,
                 carrier,
                 frame,
@@ -245,7 +260,7 @@ def bendings(robot: Robot) -> dict[str, Bending]:
                 np.vstack((shift, turn)) / scale,
                 frame.actInv(ball),
             )
-    return found
+    return bending_of
 
 
 def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
@@ -257,7 +272,7 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
             parent, child = (end[0].attributes.get("link", "") for end in ends)
             children.setdefault(parent, []).append(child)
     carried = {child for links in children.values() for child in links}
-    found: dict[str, Bending] = {}
+    bending_of_link: dict[str, Bending] = {}
     for item in robot.appendages:
         if isinstance(item, FlexibleAppendage) and item.frame in carried:  # excludes the root link
             bending = bendings(robot)[item.title]
@@ -266,9 +281,9 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
                 if robot.model.existFrame(link) and (
                     find_frame(robot.model, link).joint == bending.carrier
                 ):
-                    found[link] = bending
+                    bending_of_link[link] = bending
                     links += children.get(link, [])
-    return found
+    return bending_of_link
 
 
 def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
@@ -286,8 +301,11 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
             size = _radius(mass or 1.0)
             # An appendage without modal mass only rotates. It is drawn as a box, because the
             # rotation of a sphere would not be visible.
-            kind, sides = ("sphere", (size,)) if mass else ("box", (size,) * 3)
-            yield Shape(bending.node, kind, sides, pin.SE3(np.eye(3), bending.center))
+            placement = pin.SE3(np.eye(3), bending.center)
+            if mass:
+                yield Shape(bending.node, "sphere", (size,), placement)
+            else:
+                yield Shape(bending.node, "box", (size, size, size), placement)
 
 
 def _radius(mass: float) -> float:
@@ -323,10 +341,10 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
     The vertices are in the file's unit of length. For a COLLADA file, they are in m.
     """
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {reason(error)}") from None
-    return _loaded(path, found.st_mtime_ns, found.st_size)
+    return _loaded(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=256)
@@ -334,7 +352,9 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
     _require_plain(path)
     # The key of the cache contains the file's size and modification time, so a changed file is read
     # again.
-    parts = _colored(path) if path.suffix.lower() == ".dae" else []
+    parts = list[tuple[Array, Indices, Color | None]]()
+    if path.suffix.lower() == ".dae":
+        parts = _colored(path)
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
     if not corners.size or not np.isfinite(corners).all():
@@ -393,8 +413,8 @@ def _references(kind: str, content: bytes) -> list[str]:
     if kind == ".gltf":
         table = json.loads(content)
         parts = [*table.get("buffers", ()), *table.get("images", ())]
-        found = [unquote(part["uri"]) for part in parts if "uri" in part]
-        return [uri for uri in found if not uri.startswith("data:")]
+        uris = [unquote(part["uri"]) for part in parts if "uri" in part]
+        return [uri for uri in uris if not uri.startswith("data:")]
     return []
 
 
@@ -407,10 +427,10 @@ def _require_no_cycle(content: bytes) -> None:
         name = tag.rpartition(":")[2]
         inside = around[-1] if around else ""
         if name == "node":
-            own = attributes.get("id") or f" {len(contained)}"
-            contained.setdefault(inside, []).append(own)
-            contained.setdefault(own, [])
-            around.append(own)
+            node = attributes.get("id") or f" {len(contained)}"
+            contained.setdefault(inside, []).append(node)
+            contained.setdefault(node, [])
+            around.append(node)
         elif name == "instance_node":
             contained.setdefault(inside, []).append(attributes.get("url", "").removeprefix("#"))
 
@@ -429,7 +449,7 @@ def _require_no_cycle(content: bytes) -> None:
     # Nodes are drawn as often as they are contained, so their number can double at every level.
     drawn = dict.fromkeys(order, 1)
     for name in order:
-        drawn[name] += sum(drawn[each] for each in contained.get(name, ()))
+        drawn[name] += sum(drawn[child] for child in contained.get(name, ()))
         if drawn[name] > _MOST_NODES:
             raise ValueError(f"more than {_MOST_NODES:,} nodes")
 
@@ -441,16 +461,16 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
     try:
         scene = trimesh.load_scene(path, process=False)
         meshes = [mesh for mesh in scene.convert_units("meters").dump() if hasattr(mesh, "faces")]
-        found = list[tuple[Array, Indices, Color | None]]()
+        parts = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
             color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
             if color is not None:  # None if the file gives a texture or no colour
                 r, g, b, a = (float(x) / 255.0 for x in color)
                 color = r, g, b, a or 1.0
-            found.append((mesh.vertices, mesh.faces, color))
+            parts.append((mesh.vertices, mesh.faces, color))
     except Exception:  # a malformed file may raise anything
         return []
-    return found
+    return parts
 
 
 def _triangles(path: Path) -> tuple[Array, Indices]:

@@ -166,7 +166,8 @@ def visualize(
         q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
-        pace = positive("speed", 1.0 if speed is None else speed)
+        speed = 1.0 if speed is None else speed
+        pace = positive("speed", speed)
         page = Page(robot, q, scene, tool, frame)
         live = Live(page, q, follow=follow, speed=pace, port=port)
         for note in page.notes:
@@ -185,7 +186,7 @@ def visualize(
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     contents: dict[Path, bytes] = {}
     if isinstance(motion, Modes):
-        found, notes = mode_page(robot, motion, scene, tool)
+        page_html, notes = mode_page(robot, motion, scene, tool)
     else:
         robot = _robot_of(robot, motion)
         start, end = float(motion.t[0]), float(motion.t[-1])
@@ -193,14 +194,17 @@ def visualize(
         fps, speed, times = check_playback(fps, speed, times, start, end)
         goal = None if target is None else _configuration(robot, "target", target)
         page = Page(robot, motion.q[0], scene, tool, motion.frame)
-        found = motion_page(page, motion, fps, speed, follow, goal)
-        contents = _pictures(found, outputs, motion, speed, times)
+        page_html = motion_page(page, motion, fps, speed, follow, goal)
+        contents = _pictures(page_html, outputs, motion, speed, times)
         notes = page.notes
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     shown = outputs.get(".html") if outputs else _temporary(robot.name)
-    write_atomically(contents | ({shown: found.encode()} if shown else {}))
-    if shown and (not outputs if opened is None else opened):
+    if shown:
+        contents[shown] = page_html.encode()
+    write_atomically(contents)
+    is_opened = not outputs if opened is None else opened
+    if shown and is_opened:
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())

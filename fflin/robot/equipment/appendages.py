@@ -93,13 +93,13 @@ class FlexibleAppendage(FrozenArrays):
 
     def __post_init__(self) -> None:
         _check_names(self.frame, self.name)
-        what = f"flexible appendage '{self.frame}'"
-        frequency = np.atleast_1d(as_double(f"frequency of {what}", self.frequency))
-        damping = as_double(f"damping of {what}", self.damping)
+        label = f"flexible appendage '{self.frame}'"
+        frequency = np.atleast_1d(as_double(f"frequency of {label}", self.frequency))
+        damping = as_double(f"damping of {label}", self.damping)
         modes = frequency.size
         if frequency.ndim != 1 or not modes or damping.shape not in ((), (modes,)):
             raise InputError(
-                f"frequency and damping of {what} have shapes {frequency.shape} and "
+                f"frequency and damping of {label} have shapes {frequency.shape} and "
                 f"{damping.shape}, expected k frequencies [Hz], and k damping ratios or one "
                 "damping ratio for all"
             )
@@ -107,13 +107,13 @@ class FlexibleAppendage(FrozenArrays):
         known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
         for mode in np.flatnonzero(~known)[:1].tolist():
             raise InputError(
-                f"mode {mode + 1} of {what} has the frequency {frequency[mode]:g} Hz and the "
+                f"mode {mode + 1} of {label} has the frequency {frequency[mode]:g} Hz and the "
                 f"damping ratio {damping[mode]:g}, expected a frequency of more than 0 and less "
                 f"than {_FASTEST:g} Hz, and a ratio from 0 to 1"
             )
         for name, unit in (("translation", "kg^0.5"), ("rotation", "kg^0.5 m")):
             hint = f": one column [{unit}] for each of the {modes} frequencies"
-            value = shaped(f"{name} of {what}", getattr(self, name), (3, modes), hint)
+            value = shaped(f"{name} of {label}", getattr(self, name), (3, modes), hint)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "frequency", frequency)
         object.__setattr__(self, "damping", damping)
@@ -232,7 +232,7 @@ class FlexibleAppendage(FrozenArrays):
             totals |= {"rigid": rigid, "residual": rigid - sums}
             at = ", ".join(f"{x:.4g}" for x in body.lever)
             head += f"\n{body.mass:.5g} kg, centre of mass ({at}) m in the frame"
-        rows += [[name, "", "", *(f"{x:.4g}" for x in of)] for name, of in totals.items()]
+        rows += [[name, "", "", *(f"{x:.4g}" for x in values)] for name, values in totals.items()]
         about = "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
         return f"{head}\n{about}\n\n{grid(rows, 'l')}"
 
@@ -295,27 +295,28 @@ class Slosh:
 
     def __post_init__(self) -> None:
         _check_names(self.frame, self.name)
-        what = f"slosh '{self.frame if self.name is None else self.name}'"
+        title = self.frame if self.name is None else self.name
+        label = f"slosh '{title}'"
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
-                object.__setattr__(self, name, quantity(f"{name} of {what}", value, unit))
+                object.__setattr__(self, name, quantity(f"{name} of {label}", value, unit))
         if self.frequency is None and self.length is None:
             raise InputError(
-                f"{what} has neither a frequency nor a length; give the frequency [Hz] of a mass "
+                f"{label} has neither a frequency nor a length; give the frequency [Hz] of a mass "
                 "on springs, or the length [m] of a pendulum"
             )
-        ratio = number(f"damping of {what}", self.damping)
+        ratio = number(f"damping of {label}", self.damping)
         if not 0.0 <= ratio <= 1.0:
-            raise InputError(f"damping of {what} is {ratio:g}, expected a ratio from 0 to 1")
+            raise InputError(f"damping of {label} is {ratio:g}, expected a ratio from 0 to 1")
         if ratio and self.frequency is None:
             raise InputError(
-                f"{what} has the damping ratio {ratio:g}, but without a frequency, because a "
+                f"{label} has the damping ratio {ratio:g}, but without a frequency, because a "
                 "pendulum oscillates only under an acceleration; give the frequency [Hz] to "
                 "which the ratio refers"
             )
-        position = three_numbers(f"position of {what}", self.position)
-        axis = unit_vector(f"axis of {what}", self.axis)
+        position = three_numbers(f"position of {label}", self.position)
+        axis = unit_vector(f"axis of {label}", self.axis)
         for name, checked in (("damping", ratio), ("position", position), ("axis", axis)):
             object.__setattr__(self, name, checked)
 
@@ -380,8 +381,8 @@ class Slosh:
             If a number is not finite or not positive.
         """
         sizes = {"radius": radius, "height": height, "density": density}
-        for what, value in (sizes | {"acceleration": acceleration}).items():
-            quantity(f"{what} of the tank", value)
+        for key, value in (sizes | {"acceleration": acceleration}).items():
+            quantity(f"{key} of the tank", value)
         k = _FIRST_ROOT / radius
         along = unit_vector("axis of the tank", axis)
         liquid = density * math.pi * radius**2 * height
@@ -391,7 +392,9 @@ class Slosh:
         center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
         position = tuple(center.tolist())
         frequency = omega / (2.0 * math.pi)
-        length = acceleration / omega**2 if truth("pendulum", pendulum) else None
+        length = None
+        if truth("pendulum", pendulum):
+            length = acceleration / omega**2
         return cls(frame, share * liquid, position, frequency, length, along, damping, name)
 
     @property
@@ -423,12 +426,11 @@ class Slosh:
     def springs(self) -> dict[str, dict[str, float]]:
         """Stiffness and damping by coordinate, as {"stiffness": {name: value}, "damping": ...}."""
         omega = 2.0 * math.pi * (self.frequency or 0.0)
-        stiffness = self.modal_mass * omega**2
+        stiffness = {}
+        if self.length is None:
+            stiffness = dict.fromkeys(self.modes, self.modal_mass * omega**2)
         damping = 2.0 * self.damping * self.modal_mass * omega
-        return {
-            "stiffness": dict.fromkeys(self.modes, stiffness) if self.length is None else {},
-            "damping": dict.fromkeys(self.modes, damping),
-        }
+        return {"stiffness": stiffness, "damping": dict.fromkeys(self.modes, damping)}
 
     @property
     def axes(self) -> Array:
@@ -437,7 +439,8 @@ class Slosh:
         The vectors are in the frame's axes.
         """
         z = np.array(self.axis)
-        near = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
+        index = 0 if abs(z[0]) < 0.9 else 1
+        near = np.eye(3)[index]
         x = near - (near @ z) * z
         x /= np.linalg.norm(x)
         return np.column_stack((x, np.cross(z, x), z))
@@ -455,7 +458,10 @@ def rigid_inertia(M: Array) -> pin.Inertia:
 
 
 def _check_names(frame: object, name: object) -> None:
-    for what, value in {"frame": frame, **({} if name is None else {"name": name})}.items():
+    names = {"frame": frame}
+    if name is not None:
+        names["name"] = name
+    for key, value in names.items():
         printable = isinstance(value, str) and value.strip() and value.isprintable()
-        if not printable or (what == "name" and set(str(value)) & set("*?[]")):
-            raise InputError(f"{what} of an appendage is {value!r}, expected a name without *?[]")
+        if not printable or (key == "name" and set(str(value)) & set("*?[]")):
+            raise InputError(f"{key} of an appendage is {value!r}, expected a name without *?[]")

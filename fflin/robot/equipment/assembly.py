@@ -87,7 +87,8 @@ def equipped(
     """
     before = robot._bare
     bare = bare or robot._bare
-    checked = checked_inputs(robot.inputs if inputs is None else inputs, bare, robot.passive)
+    inputs = robot.inputs if inputs is None else inputs
+    checked = checked_inputs(inputs, bare, robot.passive)
     model, joints, followers = bare.model, bare.joints, bare.followers
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
     parts = _mounted_wheels(model, bodies, checked)
@@ -105,14 +106,15 @@ def equipped(
         model = _with_mounted(model, bodies, parts)
         placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
-        followers = tuple(each.within(model) for each in followers)
+        followers = tuple(follower.within(model) for follower in followers)
     names = [joint.name for joint in joints]
     gone = [name for name in robot.joint_names if name not in names]
     fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
     modes = {joint.name for joint in robot.modes}
     # Reset the springs of the modes only if appendages are given. Otherwise keep them, because the
     # user may have changed them.
-    for name in ("stiffness", "damping") if appendages is not None else ():
+    reset = () if appendages is None else ("stiffness", "damping")
+    for name in reset:
         of_joints = fields.get(name, getattr(robot, name))
         fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
         for item in items:
@@ -137,17 +139,22 @@ def equipped(
     )
 
 
-def _without(of: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
+def _without(table: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
     """Return a mapping without the keys that match only removed joints.
 
     Mappings inside this mapping are reduced in the same way.
     """
-    removed, others = ([f"{of}.{x}" for of in _GROUPS for x in names] for names in (gone, left))
-    return {
-        key: _without(value, gone, left) if isinstance(value, Mapping) else value
-        for key, value in of.items()
-        if stands_for_any(key, others) or not stands_for_any(key, removed)
-    }
+    removed = [f"{group}.{name}" for group in _GROUPS for name in gone]
+    others = [f"{group}.{name}" for group in _GROUPS for name in left]
+    kept: dict[str, object] = {}
+    for key, value in table.items():
+        if stands_for_any(key, removed) and not stands_for_any(key, others):
+            continue
+        if isinstance(value, Mapping):
+            kept[key] = _without(value, gone, left)
+        else:
+            kept[key] = value
+    return kept
 
 
 def with_appendages(robot: Robot, appendages: object) -> Robot:
@@ -160,19 +167,22 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
     for item in given:
         if not isinstance(item, FlexibleAppendage) or item.inertia is None:
             continue
-        # The inertia `of_file` is compared with the inertia `own`, or replaces it. `own` belongs to
-        # the link `item.frame`, or to the whole body if this frame is not a link.
+        # The inertia `file_inertia` is compared with `present_inertia`, or replaces it. The present
+        # inertia belongs to the link `item.frame`, or to the whole body if this frame is not a
+        # link.
         joint, placement = find_frame(bare.model, item.frame)
         body = bare.model.inertias[joint]
-        what = f"the body with frame '{item.frame}'"
-        of_file = rigid_inertia(item.inertia)
-        own = body
+        owner = f"the body with frame '{item.frame}'"
+        file_inertia = rigid_inertia(item.inertia)
+        present_inertia = body
         links = bare.links
         if item.frame in bare.pieces:
-            own = as_inertia(bare.pieces[item.frame])
-            what = f"link '{item.frame}'"
+            present_inertia = as_inertia(bare.pieces[item.frame])
+            owner = f"link '{item.frame}'"
         if not item.rigid:
-            _compare_inertia(item, item.inertia, own.se3Action(placement.inverse()), what)
+            _compare_inertia(
+                item, item.inertia, present_inertia.se3Action(placement.inverse()), owner
+            )
             continue
         if joint in taken:
             raise InputError(
@@ -181,13 +191,15 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
             )
         taken.add(joint)
         if item.frame in links:
-            links = {**links, item.frame: link_mass(of_file)}
-        body = body - own + of_file.se3Action(placement)
+            links = {**links, item.frame: link_mass(file_inertia)}
+        body = body - present_inertia + file_inertia.se3Action(placement)
         bare = replace(bare.with_bodies({joint: body}), links=links)
-    items = [
-        replace(item, rigid=False) if isinstance(item, FlexibleAppendage) else item
-        for item in given
-    ]
+    items: list[Appendage] = []
+    for item in given:
+        if isinstance(item, FlexibleAppendage):
+            items.append(replace(item, rigid=False))
+        else:
+            items.append(item)
     return equipped(robot, bare, appendages=items)
 
 
@@ -306,7 +318,9 @@ def _mounted_wheels(
         # Also refuse a wheel whose inertia is, up to rounding errors, the whole inertia of the link
         # about the wheel's axis. Such a link is the wheel itself.
         if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
-            lock = "" if joint == ROOT else f", or lock '{model.names[joint]}' if it is the wheel's"
+            lock = ""
+            if joint != ROOT:
+                lock = f", or lock '{model.names[joint]}' if it is the wheel's"
             raise InputError(
                 f"wheel '{name}' of {wheel.inertia:g} kg m^2 must have less inertia than the "
                 f"link that carries it, but {_carrier_name(model, joint)} has {about:.3g} kg m^2 "
@@ -315,15 +329,17 @@ def _mounted_wheels(
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
-        own = pin.Inertia(0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia]))
+        rotor_inertia = pin.Inertia(0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia]))
         turning = Joint(name, unbounded=True)
-        parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), own))
+        parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), rotor_inertia))
     return parts
 
 
 def _carrier_name(model: pin.Model, joint: int) -> str:
     """Return the name of a joint's body for messages."""
-    return "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
+    if joint == ROOT:
+        return "the base"
+    return f"the link of joint '{model.names[joint]}'"
 
 
 def turned_to(axis: Array) -> Array:
@@ -383,7 +399,9 @@ def _mounted_modes(
         body = bodies[joint]
         balls = [_ball(joint, body, column) for column in columns]
         mass = sum(ball.inertia.mass for ball in balls)
-        lighter = _LARGEST_SHARE * body.mass / mass if mass else 1.0
+        lighter = 1.0
+        if mass:
+            lighter = _LARGEST_SHARE * body.mass / mass
         if lighter < _LIGHTEST:
             raise InputError(
                 f"mode '{balls[0].joint.name}' moves the centre of mass of its body, but without "
@@ -405,15 +423,15 @@ def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[
     axes and about the origin of the appendage's frame. The rigid inertia is from the file of the
     appendage. If there is no file, it is the inertia of the carrying body.
     """
-    found: dict[str, Array] = {}
+    shares_of_mode: dict[str, Array] = {}
     for item in appendages:
         joint, placement = find_frame(model, item.frame)
         total = model.inertias[joint].se3Action(placement.inverse()).matrix()
         if isinstance(item, FlexibleAppendage) and item.inertia is not None:
             total = item.inertia
         shares = item.participation.T**2 / np.maximum(total.diagonal(), 1e-300)
-        found |= dict(zip(item.modes, shares, strict=True))
-    return found
+        shares_of_mode |= dict(zip(item.modes, shares, strict=True))
+    return shares_of_mode
 
 
 def _compare_inertia(
@@ -475,10 +493,10 @@ def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Arra
     `bodies` maps joint indices of the bare robot to the masses (N,), centres of mass (N, 3) and
     inertias (N, 3, 3) of N samples. The result is None if all samples are possible.
     """
-    found = [_carried(robot._bare.model, item) for item in robot.appendages]
+    carried = [_carried(robot._bare.model, item) for item in robot.appendages]
     impossible = []
     for joint, rows in bodies.items():
-        if of_body := [L for carrier, _, L in found if carrier == joint]:
+        if of_body := [L for carrier, _, L in carried if carrier == joint]:
             least = _least_eigenvalue(*rows, np.hstack(of_body))
             impossible += np.flatnonzero(~(least >= -_NEGATIVE)).tolist()
     return min(impossible, default=None)
@@ -522,7 +540,9 @@ def _smooth_step(x: float) -> float:
     sigma = y * y * (3.0 - 2.0 * y)
     # The distance from the ball to its joint axis is proportional to 1 / (1 - sigma). Therefore
     # sigma jumps to 1 before this distance is too large.
-    return sigma if 1.0 - sigma > 1e-6 else 1.0
+    if 1.0 - sigma > 1e-6:
+        return sigma
+    return 1.0
 
 
 class _AtBall(NamedTuple):
@@ -567,7 +587,9 @@ def _at_ball(column: Column) -> _AtBall:
 def _square_over(vector: Array, scale: float) -> float:
     """Return |vector|^2 / scale, or 0 if the vector is zero. In this case, the scale may be 0."""
     square = float(vector @ vector)
-    return square / scale if square else 0.0
+    if square == 0.0:
+        return 0.0
+    return square / scale
 
 
 def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -> Mounted:
@@ -580,7 +602,9 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     t = at.t
     r = at.along + at.across
     mass = at.fraction * column.mass
-    moment = at.fraction * column.moment if r.any() else 0.0
+    moment = 0.0
+    if r.any():
+        moment = at.fraction * column.moment
     v, w = t / (mass or 1.0), r / (moment or 1.0)
     moving, turning, lever = math.hypot(*v), math.hypot(*w), math.hypot(*at.center)
     # Bound the rotation of the appendage for a unit amplitude. The ball rotates by |w|. Its centre
@@ -602,7 +626,9 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
         pitch = float(v @ w) / turning**2
         # w x v / |w|^2, where only the part of w across v counts. It is exactly 0 for sigma = 1.
         offset = np.cross(at.across, v) / (moment * turning**2)
-        motion = pin.JointModelHZ(pitch) if pitch else pin.JointModelRZ()
+        motion = pin.JointModelRZ()
+        if pitch:
+            motion = pin.JointModelHZ(pitch)
     elif moving:
         axis = v / moving
         scale = moving
@@ -611,7 +637,8 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     # negative. If the participation is zero, S = 0 and `rotor` = 1.
     R = turned_to(axis)
     rotor = 1.0 - float(t @ v + r @ w)
-    rotor = 0.0 if abs(rotor) < 1e-13 else rotor
+    if abs(rotor) < 1e-13:
+        rotor = 0.0
     mode = Joint(column.name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
     inertia = pin.Inertia(mass, R.T @ -offset, moment * np.eye(3))
     placement = pin.SE3(R, column.p + at.center + offset)
@@ -625,7 +652,8 @@ def _liquid(slosh: Slosh, joint: int, placement: pin.SE3) -> list[Mounted]:
     # positive angles move its mass in the directions x and y.
     slides = slosh.length is None
     arm = (slosh.length or 0.0) * z
-    first, second = (turned_to(axis) for axis in ((x, y) if slides else (-y, x)))
+    axes = (x, y) if slides else (-y, x)
+    first, second = map(turned_to, axes)
     inertia = slosh.modal_mass
     rotation = float(not slides)
     across = [

@@ -93,9 +93,11 @@ def read_superelement(
         "that are clamped at the boundary": not squares[0] > 0.0,
         f"the rigid mass is {inertia[0, 0]:g}, expected more than 0": not inertia[0, 0] > 0.0,
     }
-    for fault in (fault for fault, found in faults.items() if found):
+    for fault in (fault for fault, present in faults.items() if present):
         raise InputError(f"{path}: {fault}")
-    count = len(squares) if modes is None else whole("modes", modes, 1, len(squares))
+    count = len(squares)
+    if modes is not None:
+        count = whole("modes", modes, 1, len(squares))
     meters = np.array([1.0, 1.0, 1.0, *[LENGTHS[length]] * 3])
     kilograms = MASSES[mass]
     L = rigid.T @ M[np.ix_(boundary, inner)] @ shapes[:, :count]
@@ -140,11 +142,13 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
         copy.write_text(_complete(path), "utf-8")
         if punched:
             copy.with_suffix(".pch").write_text(_complete(punch), "utf-8")
-        uset, _, found, *kept = nastran.asm2uset(str(copy), try_rdextrn=punched)
+        uset, _, boundary_mask, *kept = nastran.asm2uset(str(copy), try_rdextrn=punched)
         rigid = np.asarray(nastran.rbgeom_uset(uset))
         points = uset.loc[(slice(None), 1), "x":"z"].values.astype(float)
-    keep = kept[0] if kept else np.ones(len(rigid), dtype=bool)
-    boundary = np.asarray(found, dtype=bool)
+    keep = np.ones(len(rigid), dtype=bool)
+    if kept:
+        keep = kept[0]
+    boundary = np.asarray(boundary_mask, dtype=bool)
     if not boundary.any() or boundary.all() or not np.isfinite(points).all() or not len(points):
         raise InputError(
             f"{path} lacks boundary grids (GRID) with coordinates or modes (SPOINT); expected "
@@ -168,7 +172,7 @@ def _complete(path: Path) -> str:
             raise InputError(f"{path} includes more than {_MOST_FILES} files, or includes itself")
         content = read_file(file, "Nastran", _LARGEST_TEXT - size)
         size += len(content)
-        return _INCLUDE.sub(lambda found: text_of(included(file, found[1])), content.decode())
+        return _INCLUDE.sub(lambda match: text_of(included(file, match[1])), content.decode())
 
     def included(file: Path, written: str) -> Path:
         # A bare file name is relative to the file that includes it, any other path to the first.
@@ -199,14 +203,16 @@ def _matrices(path: Path, size: int) -> list[Array]:
     with _read_as(path, "an output4 file (.op4)"):
         from pyyeti.nastran import op4
 
-        found = op4.read(str(path), sparse=False)
-        by_name = {str(name).lower(): np.asarray(x, dtype=float) for name, x in found.items()}
+        file_matrices = op4.read(str(path), sparse=False)
+        by_name = {
+            str(name).lower(): np.asarray(x, dtype=float) for name, x in file_matrices.items()
+        }
     matrices = []
-    for what, names in (("mass", _MASS), ("stiffness", _STIFFNESS)):
-        name = next((each for each in names if each in by_name), None)
+    for kind, names in (("mass", _MASS), ("stiffness", _STIFFNESS)):
+        name = next((candidate for candidate in names if candidate in by_name), None)
         if name is None:
             raise InputError(
-                f"{path} has no {what} matrix; expected one named {' or '.join(names)}, found "
+                f"{path} has no {kind} matrix; expected one named {' or '.join(names)}, found "
                 f"{', '.join(by_name) or 'no matrix'}"
             )
         matrix = by_name[name]
@@ -216,7 +222,7 @@ def _matrices(path: Path, size: int) -> list[Array]:
             or np.abs(matrix - matrix.T).max() > _SHARE * np.abs(matrix).max()
         ):
             raise InputError(
-                f"{what} matrix '{name}' of {path} has shape {matrix.shape}; expected a finite, "
+                f"{kind} matrix '{name}' of {path} has shape {matrix.shape}; expected a finite, "
                 f"symmetric matrix of the {size} degrees of freedom of the .asm file"
             )
         matrices.append(0.5 * (matrix + matrix.T))

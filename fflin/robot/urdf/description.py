@@ -145,7 +145,12 @@ def read_pose(element: Element) -> Pose:
     if origin is None:
         return Pose()
     given = origin.attributes
-    xyz, rpy = (origin.vector(x, 3) if x in given else (0.0, 0.0, 0.0) for x in ("xyz", "rpy"))
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
+    if "xyz" in given:
+        xyz = origin.vector("xyz", 3)
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    if "rpy" in given:
+        rpy = origin.vector("rpy", 3)
     if (longest := max(map(abs, xyz))) > _FARTHEST:
         raise origin.error(
             f"xyz of {origin.title} has an entry of {longest:g} m, expected at most "
@@ -165,62 +170,65 @@ def read_pose(element: Element) -> Pose:
 def read_joint(name: str, element: Element) -> JointElement:
     """Read a <joint>, or raise `UrdfError` if it is invalid."""
     kind = element.text("type")
-    of = element.title
+    title = element.title
     if kind not in FREEDOM:
-        raise element.error(f"{of} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}")
+        raise element.error(
+            f"{title} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}"
+        )
     element.refuse_near_miss("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
     for child in element.children:
         if child.tag.endswith(":mimic"):
-            raise child.error(f"<{child.tag}> in {of} is not known to URDF; write it as <mimic>")
+            raise child.error(f"<{child.tag}> in {title} is not known to URDF; write it as <mimic>")
     parent, below = (element.require(end, "link").text("link") for end in ("parent", "child"))
     mimic = None
-    if found := element.find("mimic", "joint", "multiplier", "offset"):
-        numbers = found.number("multiplier", 1.0), found.number("offset", 0.0)
-        mimic = Mimic(found.text("joint"), *numbers)
+    if mimic_element := element.find("mimic", "joint", "multiplier", "offset"):
+        numbers = mimic_element.number("multiplier", 1.0), mimic_element.number("offset", 0.0)
+        mimic = Mimic(mimic_element.text("joint"), *numbers)
     joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
     # Read the axis, dynamics and limits only of joints with one degree of freedom. Do not check the
     # axis of any other joint, because exporters may write an axis of zeros.
     if FREEDOM[kind] != 1:
         return joint
-    if found := element.find("axis", "xyz"):
-        joint = joint._replace(axis=found.vector("xyz", 3))
+    if axis_element := element.find("axis", "xyz"):
+        joint = joint._replace(axis=axis_element.vector("xyz", 3))
         length = math.hypot(*joint.axis)
         if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
-            raise found.error(
-                f"{found.title} has length {length:g}, expected a direction such as 0 0 1"
+            raise axis_element.error(
+                f"{axis_element.title} has length {length:g}, expected a direction such as 0 0 1"
             )
-    if found := element.find("dynamics", "damping", "friction"):
-        damping, friction = (found.number(x, 0.0) for x in ("damping", "friction"))
+    if dynamics := element.find("dynamics", "damping", "friction"):
+        damping, friction = (dynamics.number(x, 0.0) for x in ("damping", "friction"))
         if min(damping, friction) < 0.0:
-            raise found.error(
-                f"damping {damping:g} and friction {friction:g} of {of}: expected 0 or more; "
+            raise dynamics.error(
+                f"damping {damping:g} and friction {friction:g} of {title}: expected 0 or more; "
                 "correct the negative value"
             )
         joint = joint._replace(damping=damping, friction=friction)
-    if found := element.find("limit"):
-        joint = joint._replace(limits=_limits(found))
+    if limit_element := element.find("limit"):
+        joint = joint._replace(limits=_limits(limit_element))
     return joint
 
 
-def _limits(found: Element) -> dict[str, float]:
+def _limits(element: Element) -> dict[str, float]:
     """Return the limits of a <limit>; an invalid limit becomes infinite.
 
     An invalid limit causes only a note, because A and B do not depend on limits.
     """
     limits: dict[str, float] = {}
-    for name in (x for x in ("lower", "upper", "effort", "velocity") if x in found.attributes):
-        value = decimal(found.attributes[name].strip())
+    for name in (x for x in ("lower", "upper", "effort", "velocity") if x in element.attributes):
+        written = element.attributes[name]
+        value = decimal(written.strip())
         if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
-            found.note(
-                f"limit {name} of {found.owner} is {quoted(found.attributes[name])}, expected a "
-                "number (0 or more for effort and velocity); the limit is ignored"
+            element.note(
+                f"limit {name} of {element.owner} is {quoted(written)}, expected a number (0 or "
+                "more for effort and velocity); the limit is ignored"
             )
             value = -math.inf if name == "lower" else math.inf
         limits[name] = max(-UNLIMITED, min(value, UNLIMITED))
     lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
     if lower > upper:
-        found.note(
-            f"lower limit {lower:g} of {found.owner} exceeds its upper limit {upper:g}; both "
+        element.note(
+            f"lower limit {lower:g} of {element.owner} exceeds its upper limit {upper:g}; both "
             "position limits are ignored"
         )
         limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
@@ -238,11 +246,11 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             if leader not in joints:
                 error = unknown("joint", leader[:60], [name[:60] for name in joints])
                 raise element.error(f"{element.title} mimics a joint that does not exist: {error}")
-            for each in (follower, leader):
-                if joints[each].freedom != 1:
+            for joint_name in (follower, leader):
+                if joints[joint_name].freedom != 1:
                     raise element.error(
-                        f"{element.title} mimics {quoted(leader)}, but {quoted(each)} is "
-                        f"{joints[each].type}; both joints must have one degree of freedom"
+                        f"{element.title} mimics {quoted(leader)}, but {quoted(joint_name)} is "
+                        f"{joints[joint_name].type}; both joints must have one degree of freedom"
                     )
             if leader in chain:
                 loop = [*chain[chain.index(leader) :], leader]
@@ -277,12 +285,12 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
     links = {name: read_link(name, element) for name, element in _by_name(root, "link").items()}
-    if not 0 < len(links) <= _LINK_LIMIT:
+    if not links:
+        raise root.error("<robot> has no <link>; add one")
+    if len(links) > _LINK_LIMIT:
         raise root.error(
-            "<robot> has no <link>; add one"
-            if not links
-            else f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links "
-            "that are fixed to each other"
+            f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links that are "
+            "fixed to each other"
         )
     joints = {name: read_joint(name, element) for name, element in _by_name(root, "joint").items()}
     _check_tree(root, links, joints)
@@ -291,15 +299,15 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
 
 def _by_name(root: Element, tag: str) -> dict[str, Element]:
     """Return {name: element} of the children with a tag; raise `UrdfError` for a repeated name."""
-    found: dict[str, Element] = {}
+    elements: dict[str, Element] = {}
     for element in root.find_all(tag):
         name = element.text("name")
-        if (earlier := found.setdefault(name, element)) is not element:
+        if (earlier := elements.setdefault(name, element)) is not element:
             raise element.error(
                 f"a second {tag} has the name {quoted(name)}, which is already used in line "
                 f"{earlier.line}; rename one of them"
             )
-    return found
+    return elements
 
 
 def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> None:
@@ -307,16 +315,16 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
     above: dict[str, JointElement] = {}
     children: dict[str, list[str]] = {}
     for joint in joints.values():
-        of = joint.element.title
+        title = joint.element.title
         for end, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
                 error = unknown("link", name[:60], [link[:60] for link in links])
-                raise joint.element.error(f"the {end} of {of} does not exist: {error}")
+                raise joint.element.error(f"the {end} of {title} does not exist: {error}")
         if other := above.get(joint.child):
             raise joint.element.error(
-                f"link {quoted(joint.child)} is the child of {of} and of {other.element.title} in "
-                f"line {other.element.line}; a link can have only one parent, because URDF has no "
-                "closed loops; remove one of these joints"
+                f"link {quoted(joint.child)} is the child of {title} and of {other.element.title} "
+                f"in line {other.element.line}; a link can have only one parent, because URDF has "
+                "no closed loops; remove one of these joints"
             )
         above[joint.child] = joint
         children.setdefault(joint.parent, []).append(joint.child)
@@ -333,10 +341,11 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
         for name in level:
             above.pop(name, None)
         level = [child for name in level for child in children.get(name, ())]
-    for joint in above.values():  # no path leads from the root to these joints
-        raise joint.element.error(
-            f"{named('joint', [each.name for each in above.values()])} form a closed loop without "
-            "a root; correct a parent or child in it"
+    loop = [*above.values()]  # no path leads from the root to these joints
+    if loop:
+        raise loop[0].element.error(
+            f"{named('joint', [joint.name for joint in loop])} form a closed loop without a root; "
+            "correct a parent or child in it"
         )
     if depth > _DEPTH_LIMIT:
         raise root.error(

@@ -158,9 +158,9 @@ def ignored(
         zero.setdefault(names, []).append(limit)
     for names, limits in zero.items():
         if names:
-            of = named("joint", names) if len(names) < 3 else f"{len(names)} joints"
-            said = f"{origin}: {', '.join(limits)} 0 of {of}: no limit (or passive)"
-            yield "passive", names, said
+            affected = named("joint", names) if len(names) < 3 else f"{len(names)} joints"
+            warning = f"{origin}: {', '.join(limits)} 0 of {affected}: no limit (or passive)"
+            yield "passive", names, warning
 
 
 def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]) -> str:
@@ -242,12 +242,12 @@ def _expand(
             f"{failed}: the expansion takes more than {XACRO_LIMIT:g} s; look for a macro or an "
             "expression that never ends"
         ) from None
-    said = done.stderr.decode(errors="replace").splitlines()
+    messages = done.stderr.decode(errors="replace").splitlines()
     if done.returncode:
-        why = " ".join(said[-1:]) or f"its process ended with exit code {done.returncode}"
+        why = " ".join(messages[-1:]) or f"its process ended with exit code {done.returncode}"
         raise UrdfError(f"{failed}: {why[:300]}")
     line, _, urdf = done.stdout.partition(b"\n")
     head = json.loads(line)
     remember(*head["files"])
     require_known(f"xacro argument of {path.name}", arguments, head["arguments"])
-    return urdf, [f"{path.name}: {line}" for line in said if line]
+    return urdf, [f"{path.name}: {line}" for line in messages if line]

@@ -58,7 +58,9 @@ class Element:
         """Name of this element for messages, such as "<axis> of joint 'a'"."""
         if self.owner.startswith(f"{self.tag} "):
             return self.owner
-        return f"<{self.tag}>{' of ' * bool(self.owner)}{self.owner}"
+        if not self.owner:
+            return f"<{self.tag}>"
+        return f"<{self.tag}> of {self.owner}"
 
     def error(self, message: str) -> UrdfError:
         """Build an error that names the file and line of this element."""
@@ -78,13 +80,16 @@ class Element:
         If `attributes` are given, they are the known attributes of the child. An unknown attribute
         of the child raises `UrdfError` if it is similar to a known one; otherwise it causes a note.
         """
-        found = self.find_all(tag)
-        if len(found) > 1:
-            raise found[1].error(
-                f"{self.title} has a second <{tag}>; the first <{tag}> is in line {found[0].line}; "
-                "keep one of them"
+        children = self.find_all(tag)
+        if len(children) > 1:
+            raise children[1].error(
+                f"{self.title} has a second <{tag}>; the first <{tag}> is in line "
+                f"{children[0].line}; keep one of them"
             )
-        for child in found if attributes else ():
+        if not children:
+            return None
+        child = children[0]
+        if attributes:
             for name in (x for x in child.attributes if x not in attributes and ":" not in x):
                 if nearest(name.lower(), attributes, _NEAR):
                     raise child.error(
@@ -94,14 +99,14 @@ class Element:
                 child.note(
                     f"attribute {quoted(name)} of <{tag}> is not part of URDF, and is ignored"
                 )
-        return found[0] if found else None
+        return child
 
     def require(self, tag: str, *attributes: str) -> Element:
         """Return the child that `find` returns, or raise `UrdfError` if there is none."""
-        found = self.find(tag, *attributes)
-        if found is None:
+        child = self.find(tag, *attributes)
+        if child is None:
             raise self.error(f"{self.title} has no <{tag}>; add it")
-        return found
+        return child
 
     def refuse_near_miss(self, *known: str) -> None:
         """Raise `UrdfError` if the tag of a child is a misspelt known tag.
@@ -129,8 +134,8 @@ class Element:
         """Return an attribute, or raise `UrdfError` if it is missing or empty."""
         value = self.attributes.get(name)
         if value is None or not value.strip():
-            what = "has no" if value is None else "has an empty"
-            raise self.error(f"{self.title} {what} '{name}'; write <{self.tag} {name}=\"...\">")
+            problem = "has no" if value is None else "has an empty"
+            raise self.error(f"{self.title} {problem} '{name}'; write <{self.tag} {name}=\"...\">")
         return value
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -151,23 +156,28 @@ class Element:
         wrong = [entry for entry, x in zip(entries, values, strict=True) if not abs(x) <= _LARGEST]
         if len(values) != size or wrong:
             given = f"{quoted(text)}, which has {len(values)} entries"
-            given = quoted(wrong[0]) if len(values) == size else given
-            wanted = "a finite number, such as 0.5," if size == 1 else f"{size} finite numbers"
-            raise self.error(
-                f"{name} of {self.title} is {given}; expected {wanted} of at most {_LARGEST:g}"
-                + ", separated by spaces, without commas" * (size > 1)
-            )
+            if len(values) == size:
+                given = quoted(wrong[0])
+            wanted = f"a finite number, such as 0.5, of at most {_LARGEST:g}"
+            if size > 1:
+                wanted = f"{size} finite numbers of at most {_LARGEST:g}"
+                wanted += ", separated by spaces, without commas"
+            raise self.error(f"{name} of {self.title} is {given}; expected {wanted}")
         return values
 
 
 def decimal(text: str) -> float:
     """Return the value of a text that is a decimal number or "inf"; NaN for any other text."""
-    return float(text) if _DECIMAL.fullmatch(text) else math.nan
+    if not _DECIMAL.fullmatch(text):
+        return math.nan
+    return float(text)
 
 
 def quoted(text: str) -> str:
     """Return text from a file for an error message: quoted, short, printable and on one line."""
-    return repr(text if len(text) <= 60 else f"{text[:57]}...")
+    if len(text) > 60:
+        text = f"{text[:57]}..."
+    return repr(text)
 
 
 def enumerated(names: Iterable[str]) -> str:
@@ -177,7 +187,8 @@ def enumerated(names: Iterable[str]) -> str:
 
 def named(kind: str, names: Sequence[str]) -> str:
     """Return a noun with quoted names, such as "joint 'a'" or "joints 'a', 'b'"."""
-    return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
+    plural = "s" if len(names) > 1 else ""
+    return f"{kind}{plural} {enumerated(names)}"
 
 
 def notes_of(root: Element) -> list[str]:
@@ -185,11 +196,13 @@ def notes_of(root: Element) -> list[str]:
     # Notes are saved with the robot. Therefore they contain the name of the file, but not its
     # folder, which may differ on another computer.
     origin = root.origin.rpartition(os.sep)[2]
-    return [
-        f"{origin}:{lines[0]}: {message}"
-        + (f" (also {len(lines) - 1} more times)" if len(lines) > 1 else "")
-        for message, lines in root.notes.items()
-    ]
+    notes = []
+    for message, lines in root.notes.items():
+        note = f"{origin}:{lines[0]}: {message}"
+        if len(lines) > 1:
+            note += f" (also {len(lines) - 1} more times)"
+        notes.append(note)
+    return notes
 
 
 def parse(document: bytes, origin: str) -> Element:
