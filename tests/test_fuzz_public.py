@@ -19,7 +19,7 @@ from tests.support.patience import finished
 pytestmark = pytest.mark.fuzz
 
 # What a function of the caller's own raises is the caller's.
-CALLED = {"policy", "disturbance", "callback", "progress"}
+CALLED = {"policy", "disturbance", "callback", "progress", "guess"}
 
 # Weights, some of which need seconds; where they are designed with, the quick lqr answers for all.
 SLOW, WEIGHTS = (
@@ -68,7 +68,15 @@ RESULTS = {
         "Mode",
     ),
     *("LFT", "Sensitivity", "Uncertain"),
-    *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
+    *(
+        "Modes",
+        "Motion",
+        "Observability",
+        "Policy",
+        "RandomConfigurations",
+        "ReducedModel",
+        "Robot",
+    ),
     *("RelativeEquilibria", "RelativeEquilibrium", "ToolModel", "Validity"),
 }
 

@@ -377,6 +377,8 @@ class HasPoles(Protocol):
 
 def summary_of_poles(design: HasPoles) -> str:
     """Return the number of poles, the slowest decay and the smallest damping ratio."""
+    if not len(design.poles):
+        return "no poles"
     rates = rates_of(design.poles, design.dt)
     damping = float((-rates.real / np.abs(rates)).min())
     return (
@@ -390,6 +392,8 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
 
     A conjugate pair or a multiple pole has one row.
     """
+    if not len(design.poles):
+        return f"{matrix} has no poles"
     poles = design.poles[design.poles.imag >= 0.0]
     rates = rates_of(poles, design.dt)
     pole_title = "pole" if design.dt else "pole [1/s]"

