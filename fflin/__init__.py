@@ -62,7 +62,7 @@ _PUBLIC = {
         "uncertainty.lft": "LFT",
     },
     "Policies": {
-        "control.policy": "Policy",
+        "control.policy": "Policy StateForm",
         "control.policies": "StateFeedback Allocation",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",

@@ -107,6 +107,7 @@ from fflin.uncertainty.lft import LFT as LFT
 
 # Policies
 from fflin.control.policy import Policy as Policy
+from fflin.control.policy import StateForm as StateForm
 from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation

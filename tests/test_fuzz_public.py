@@ -73,6 +73,7 @@ RESULTS = {
         "Motion",
         "Observability",
         "Policy",
+        "StateForm",
         "RandomConfigurations",
         "ReducedModel",
         "Robot",

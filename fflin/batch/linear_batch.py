@@ -247,7 +247,9 @@ class LinearBatch(ModelHeader):
         """
         from fflin.batch.tool_batch import tool_batch
 
-        robot = self[0]._robot if len(self) else None
+        if not len(self):
+            raise InputError("the batch has no points; there is nothing to convert")
+        robot = self[0]._robot
         if robot is None:
             raise InputError(
                 "the batch does not contain its robot; load it with "

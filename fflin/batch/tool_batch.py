@@ -148,7 +148,7 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
 
 
 class _Points:
-    """Points of a batch, with what their change of coordinates depends on.
+    """Points of a batch, and the quantities that determine their change of coordinates.
 
     The derivatives of the coordinates depend on the attitude, the twist and the acceleration of the
     base and on the wrench of the inputs on it, but not on the joints. So points that share these

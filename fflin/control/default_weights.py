@@ -199,7 +199,10 @@ def _of_inertia(
 
 
 def _input_costs(lin: LinearModel, S: Array, D: Array) -> Array:
-    """Return the diagonal of R (nu,), up to a factor: an input costs what it moves."""
+    """Return the diagonal of R (nu,), up to a factor.
+
+    The weight of an input is the sum of the squares of its generalised forces, divided by D (10.7).
+    """
     cost: Array = (S**2 / D[:, None]).sum(axis=0)
     if not cost.all():
         raise InputError(

@@ -191,7 +191,7 @@ class LinearController(Feedback):
 
     @property
     def fed_back(self) -> tuple[str, ...]:
-        """Names of the states that the outputs measure on which the controller acts."""
+        """Names of the states in the measured outputs of the controller."""
         acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
         return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
 

@@ -86,7 +86,8 @@ class StateFeedback(Feedback):
     Raises
     ------
     InputError
-        If K has a wrong shape, or the model is about a moving reference (``moving=True``).
+        If K has a wrong shape or was designed for another model, or the model is about a moving
+        reference (``moving=True``).
 
     Examples
     --------
@@ -103,7 +104,10 @@ class StateFeedback(Feedback):
 
     def __post_init__(self) -> None:
         hint = " (nu, nx); give the gain that was designed for this model"
-        K = self.K.K if isinstance(self.K, Gain) else self.K
+        K = self.K
+        if isinstance(K, Gain):
+            _require_designed_for(K, self.lin)
+            K = K.K
         self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
         self.lin = held_if_possible(self.lin)
 
@@ -153,6 +157,24 @@ class StateFeedback(Feedback):
         """
         state = self.state_map(robot)
         return readout(state, *self.terms(state))
+
+
+def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
+    """Raise `InputError` if a gain was designed for a model with other signals or another point."""
+    same = {
+        "states": gain.state_names == lin.state_names,
+        "inputs": gain.input_names == lin.input_names,
+        "sampling time": bool(np.isclose(gain.dt, lin.dt)),
+        "frame": gain.frame == lin.frame,
+        "point": gain.x0.shape == lin.x0.shape and bool(np.allclose(gain.x0, lin.x0, atol=1e-9)),
+        "reference": bool(np.allclose(gain.placement, lin.placement, atol=1e-9)),
+    }
+    different = [name for name, agrees in same.items() if not agrees]
+    if different:
+        raise InputError(
+            f"the gain was designed for a model of '{gain.robot}' with another {different[0]} than "
+            "the given model; give the model of the gain, or its matrix gain.K"
+        )
 
 
 @dataclass(eq=False)

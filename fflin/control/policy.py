@@ -46,12 +46,45 @@ _ROUNDING = 1e-6
 _FUNCTIONS = FunctionType, BuiltinFunctionType
 
 
+# Members of `Policy` that describe the law that `bind` returns.
+_DESCRIBING = (
+    "form",
+    "feedback_gain",
+    "closed_loop",
+    "loop_around",
+    "loop_notes",
+    "prediction",
+)
+
+
+def _provider(cls: type, name: str) -> type:
+    """Return the class from which a class has a member."""
+    return next(base for base in cls.__mro__ if name in vars(base))
+
+
 class StateForm(NamedTuple):
     """Data of the law u = offset - K x of a robot's full state x.
 
-    K may depend on joint positions. `grid` contains {joint: values} of its grid, or is empty.
-    `gains` (N, nu, nx) and `offsets` (N, nu) contain K and the offset at the points of the grid.
-    Angles of continuous joints are unwrapped near the state `x0` (nx,).
+    `Policy.form` returns these data, with which the compiled loop computes the commands.
+
+    Attributes
+    ----------
+    offsets : ndarray (N, nu)
+        Offsets at the points of the grid; N is 1 without a grid.
+    gains : ndarray (N, nu, nx)
+        Gains K at the points of the grid.
+    x0 : ndarray (nx,)
+        State near which the angles of continuous joints are unwrapped.
+    grid : mapping
+        {joint: values} of the grid of joint positions over which K is interpolated; may be empty.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> form = fflin.StateFeedback(lin, fflin.lqr(lin).K).form(robot)
+    >>> isinstance(form, fflin.StateForm), form.gains.shape
+    (True, (1, 9, 18))
     """
 
     offsets: Array
@@ -82,8 +115,9 @@ class Policy(ABC):
 
     A subclass must define `bind`. All other members have defaults, with which a law works in
     simulations and campaigns. A law that overrides them gets more: the default step follows from
-    `closed_loop`, reports judge the states in `fed_back`, and `form` lets the compiled loop fly the
-    law. A subclass that redefines `bind` without `form` is computed in Python.
+    `closed_loop`, reports judge the states in `fed_back`, and the compiled loop flies a law whose
+    `form` returns a `StateForm`. A subclass that redefines `bind` does not inherit the members that
+    describe the law, such as `form` and `feedback_gain`.
 
     A plain function policy(t, q, v) -> u is also accepted wherever a policy is.
 
@@ -119,9 +153,12 @@ class Policy(ABC):
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
-        # Inherited data do not describe a law that binds itself in another way.
-        if "bind" in vars(cls) and "form" not in vars(cls):
-            cls.form = Policy.form  # type: ignore[method-assign]
+        # A member that describes the law is inherited only together with the method `bind` that it
+        # describes.
+        binding = _provider(cls, "bind")
+        for name in _DESCRIBING:
+            if not issubclass(_provider(cls, name), binding):
+                setattr(cls, name, vars(Policy)[name])
 
     @abstractmethod
     def bind(self, robot: Robot) -> Command:
@@ -139,7 +176,7 @@ class Policy(ABC):
 
     @property
     def feedback_gain(self) -> Array | None:
-        """Gain K (nu, nx) of the states of `model`; None if the law is no constant gain."""
+        """Gain K (nu, nx) of the states of `model`; None if the law is not a constant gain."""
         return None
 
     @property
@@ -161,7 +198,7 @@ class Policy(ABC):
 
     @property
     def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
-        """Frame and reference of the states; each is None if the law leaves it open."""
+        """Frame and reference of the states; each is None if the law accepts any."""
         if self.model is None:
             return None, None
         return self.model.frame, self.model.reference
@@ -178,7 +215,7 @@ class Policy(ABC):
 
     @property
     def inner(self) -> Policy:
-        """The law that decides; it differs from this one for an allocation."""
+        """Law that computes the commands: the policy in an `Allocation`, otherwise this law."""
         return self
 
     @property
@@ -210,7 +247,7 @@ class Policy(ABC):
     def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
         """Return the reference inputs at the start, or None if the law has none.
 
-        `names` are the inputs of the robot. An allocation commands others.
+        `names` are the inputs of the robot. An allocation commands other inputs.
         """
         lin = self.model
         if lin is None or lin.input_names != names:
@@ -225,7 +262,7 @@ class Policy(ABC):
         return "at its target", initial[None]
 
     def held_for(self, seconds: float) -> Policy:
-        """Return the law for commands that are held for some seconds."""
+        """Return the law for commands that are held for `seconds` [s]."""
         return self
 
     def fresh(self) -> Policy:
@@ -315,6 +352,9 @@ class FunctionPolicy(Policy):
     given: Any
 
     def __post_init__(self) -> None:
+        if isinstance(self.given, type):
+            name = self.given.__name__
+            raise InputError(f"policy is the class {name}, expected an object of it: {name}(...)")
         if not (callable(self.given) or callable(getattr(self.given, "bind", None))):
             raise InputError(
                 f"policy has type {type(self.given).__name__}, expected policy(t, q, v) -> u, such "
@@ -363,8 +403,8 @@ def bound(policy: object, robot: Robot) -> Command:
     command = law.bind(robot)
     if not callable(command):
         raise InputError(
-            f"policy has type {law.kind}, expected policy(t, q, v) -> u, such as "
-            "StateFeedback(lin, gain.K)"
+            f"{law.kind}.bind(robot) returned an object of type {type(command).__name__}, expected "
+            "a function (t, q, v) -> u"
         )
     function("policy", command, "(t, q, v)")
     return command

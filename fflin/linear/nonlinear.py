@@ -109,8 +109,8 @@ class Nonlinear:
         return float((np.abs(expected - rates) / scale).max())
 
 
-# Each repetition of the differences of `jacobians` has steps that are divided by a ratio, and
-# another point. The point differs by _NEGLIGIBLE of the steps, with the sign of the second value.
+# (ratio, sign) of each repetition of the differences of `jacobians`: the steps are divided by the
+# ratio, and curved variables are displaced by sign * _NEGLIGIBLE * steps.
 _REPETITIONS = (1.5, 1.0), (1.2, -1.0)
 
 # Fraction of a step that changes the rounding errors of a function, but not its derivatives.
@@ -122,10 +122,10 @@ def jacobians(
 ) -> tuple[Array, list[Array]]:
     """Return the Jacobian of f at a point by central differences, and repetitions of it.
 
-    The repetitions have smaller steps than the given ones. Their attitude and joint positions
-    differ by a negligible fraction of the steps, so that all rounding errors are independent. The
-    differences between the Jacobians show the truncation error and the rounding error of the first
-    one.
+    The repetitions have smaller steps than the given ones. Their curved variables, if there are
+    any, differ by a negligible fraction of the steps, so that their rounding errors are
+    independent. The differences between the Jacobians show the truncation error and the rounding
+    error of the first one.
     """
     again = []
     for ratio, sign in _REPETITIONS:

@@ -30,8 +30,8 @@ from fflin.linear.scales import (
 )
 from fflin.robot.joints import find_frame
 
-# Number of rows with the contributions of a body: its share of the centre of mass, its linear and
-# its angular momentum.
+# Number of rows with the contributions of a body: its mass-weighted centre of mass, its linear
+# momentum and its angular momentum.
 _PER_BODY = 9
 
 

@@ -5,6 +5,7 @@ These entries are called lanes. If there are fewer than eight runs, the remainin
 last run.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
@@ -14,10 +15,10 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import rotation_matrix
-from fflin.base.validation import Array, Indices, Mask, vector
+from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
 from fflin.control.policies import Sample, measured_at
-from fflin.control.policy import OutputForm, PathForm, StateForm
+from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
@@ -25,6 +26,7 @@ from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there, wit
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
 
@@ -54,6 +56,24 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     return "python"
 
 
+def form_of(policy: Policy, robot: Robot) -> Form | None:
+    """Return the data of a policy for a robot, or None; raise `InputError` if they are invalid."""
+    form = policy.form(robot)
+    if form is None or isinstance(form, OutputForm | PathForm):
+        return form
+    what = f"{policy.kind}.form(robot)"
+    if not isinstance(form, StateForm):
+        kind = type(form).__name__
+        raise InputError(f"{what} has type {kind}, expected a fflin.StateForm or None")
+    points = math.prod(len(values) for values in form.grid.values())
+    nx = 12 + 2 * robot.n
+    nu = sum(len(names) for _, names in robot.named_inputs)
+    shaped(f"offsets of {what}", form.offsets, (points, nu), " (points of the grid, nu)")
+    shaped(f"gains of {what}", form.gains, (points, nu, nx), " (points of the grid, nu, nx)")
+    shaped(f"x0 of {what}", form.x0, (nx,), " (nx)")
+    return form
+
+
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
     plant = plan.plant
@@ -64,7 +84,7 @@ def not_compilable(plan: Plan) -> str:
     if plan.policy:
         policy = plan.policy.inner
         design = plan.policy.commanded_robot
-        form = policy.form(design or plant.robot)
+        form = form_of(policy, design or plant.robot)
         if design:
             robots.append(design)
     reason = ""
@@ -415,7 +435,7 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     if plan.policy:
         if design := plan.policy.commanded_robot:
             asking = Plant(StateMap(design, reference=state.reference, frame=state.frame))
-        form = plan.policy.inner.form(asking.robot)
+        form = form_of(plan.policy.inner, asking.robot)
     law = no_law(state, np.zeros(len(asking.actuation.names)))
     if asking is not plan.plant:
         law = law._replace(allocation=_allocation(plan.plant, asking, mechanics))

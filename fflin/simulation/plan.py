@@ -354,7 +354,10 @@ def sample_of(policy: Policy | None, sample: float | None) -> float | None:
         return _positive("sample", sample)
     if policy is None:
         return None
-    return policy.sample_time or None
+    seconds = number(f"sample_time of {policy.kind}", policy.sample_time)
+    if seconds == 0.0:
+        return None
+    return _positive(f"sample_time of {policy.kind}", seconds)
 
 
 def step_of(

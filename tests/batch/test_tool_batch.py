@@ -79,4 +79,7 @@ def test_a_batch_without_its_robot_names_the_remedy(tmp_path):
     fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 0.1]})).save(tmp_path / "batch.npz")
     with pytest.raises(fflin.InputError, match="robot"):
         fflin.LinearBatch.load(tmp_path / "batch.npz").to("drake")
-    agree(fflin.LinearBatch.load(tmp_path / "batch.npz", robot), "drake")
+    batch = fflin.LinearBatch.load(tmp_path / "batch.npz", robot)
+    agree(batch, "drake")
+    with pytest.raises(fflin.InputError, match="no points"):
+        batch[:0].to("drake")

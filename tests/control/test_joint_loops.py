@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.control.optimal.floating_base import FloatingBase
+from fflin.control.optimal.initial_guess import initial_guess
 from fflin.control.optimal.joint_loops import (
     MOST_CIRCLES,
     STEPS,
@@ -15,6 +16,7 @@ from fflin.control.optimal.joint_loops import (
     best_plane,
     curvature,
 )
+from fflin.control.optimal.shooting import Shooting
 from tests.support.mechanisms import motors
 from tests.support.robots import random_tree
 
@@ -165,6 +167,26 @@ def test_more_circles_reach_what_one_circle_within_the_limits_cannot(polar):
     assert most < np.deg2rad(25.0)
     loops = loops_of(polar, start, target, limits)
     assert loops.best(1)[1] > 0.02 and loops.best(4)[1] < 0.01
+
+
+def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(polar, monkeypatch):
+    allowed = []
+
+    def best(loops, most):
+        allowed.append(most)
+        return loops.path, 1.0
+
+    monkeypatch.setattr(Loops, "best", best)
+    robot = polar.replace(inputs=motors(polar))
+    start = fflin.configuration(robot, {"slide": 0.6}), np.zeros(robot.nv)
+    end = fflin.configuration(robot, {"slide": 0.6}), np.zeros(robot.nv)
+    end[0][3:7] = [0.0, 0.0, np.sin(0.1), np.cos(0.1)]
+    nx = 12 + 2 * robot.n
+    for knots, most in ((20, 2), (150, MOST_CIRCLES)):
+        shooting = Shooting(robot, np.linspace(0.0, 10.0, knots), held=True)
+        bounds = np.full((2, nx), np.inf) * [[-1.0], [1.0]]
+        initial_guess(shooting, None, start, end, np.full(nx, True), bounds, np.ones(robot.n))
+        assert allowed.pop() == most
 
 
 @pytest.mark.exhaustive

@@ -5,7 +5,7 @@ import pytest
 
 import fflin
 from fflin.control.policy import FunctionPolicy, as_policy
-from fflin.simulation.lanes import not_compilable
+from fflin.simulation.lanes import form_of, not_compilable
 from fflin.simulation.plan import Plan, SimulationOptions
 
 
@@ -84,10 +84,78 @@ def test_data_for_compiled_code_are_not_inherited_by_another_law(lin, K):
             feedback = super().bind(robot)
             return lambda t, q, v: 0.5 * feedback(t, q, v)
 
+    class Mixin:
+        def bind(self, robot):
+            return lambda t, q, v: np.ones(9)
+
+    class Mixed(Mixin, fflin.StateFeedback):
+        pass
+
     assert fflin.StateFeedback(lin, K).form(robot) is not None
-    assert Halved(lin, K).form(robot) is None
-    plan = Plan(SimulationOptions(robot=robot, policy=Halved(lin, K), duration=1.0))
-    assert "Halved is computed in Python" in not_compilable(plan) or "numba" in not_compilable(plan)
+    for law in (Halved(lin, K), Mixed(lin, K)):
+        assert law.form(robot) is None and law.feedback_gain is None and law.closed_loop() is None
+        assert law.prediction(lin, fflin.StateMap(robot)) is None and law.model is lin
+        plan = Plan(SimulationOptions(robot=robot, policy=law, duration=1.0))
+        reason = not_compilable(plan)
+        assert f"{law.kind} is computed in Python" in reason or "numba" in reason
+
+
+def test_data_that_do_not_fit_the_robot_are_refused(lin, K):
+    robot = fflin.load("planar_detumble")
+    whole = fflin.StateFeedback(lin, K).form(robot)
+
+    class Law(fflin.StateFeedback):
+        data = None
+
+        def form(self, robot):
+            return self.data
+
+    for data, words in (
+        (whole._replace(gains=whole.gains[:, :, :5]), "gains"),
+        (whole._replace(offsets=whole.offsets[0]), "offsets"),
+        (whole._replace(x0=np.full(18, np.nan)), "x0"),
+        (whole._replace(grid={"joint_1": np.array([0.0, 1.0])}), "offsets"),
+        (3, "StateForm"),
+    ):
+        Law.data = data
+        with pytest.raises(fflin.InputError, match=words):
+            form_of(Law(lin, K), robot)
+
+
+@pytest.mark.parametrize("value", [-0.1, np.nan, "often"])
+def test_a_sample_time_is_positive(lin, K, value):
+    class Law(Integrating):
+        sample_time = value
+
+    with pytest.raises(fflin.InputError, match="sample_time of Law"):
+        fflin.simulate(fflin.load("planar_detumble"), Law(lin, K), duration=1.0)
+
+
+def test_what_is_no_law_is_named():
+    robot = fflin.load("planar_detumble")
+
+    class Empty(fflin.Policy):
+        def bind(self, robot):
+            return None
+
+    with pytest.raises(fflin.InputError, match=r"Empty.bind\(robot\) returned"):
+        fflin.simulate(robot, Empty(), duration=1.0)
+    with pytest.raises(fflin.InputError, match="class Empty"):
+        fflin.simulate(robot, Empty, duration=1.0)
+
+
+def test_a_gain_of_another_model_is_refused(lin):
+    gain = fflin.lqr(lin)
+    robot = fflin.load("planar_detumble")
+    moved = fflin.linearize(robot, fflin.configuration(robot, {"joint_1": 0.3}))
+    for model, words in (
+        (moved, "point"),
+        (lin.discretize(0.1), "sampling time"),
+        (fflin.linearize(robot, frame="local"), "frame"),
+        (fflin.linearize(fflin.load("ets_vii")), "states"),
+    ):
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.StateFeedback(model, gain)
 
 
 def test_functions_are_policies_and_other_objects_are_refused():

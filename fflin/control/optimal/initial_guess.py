@@ -145,7 +145,8 @@ def _with_loops(
     )
     joints = loops.path
     if np.linalg.norm(loops.error(joints)) > _REACHED:
-        joints, _ = loops.best(max(1, len(shooting.h) // _INTERVALS_PER_CIRCLE))
+        circles = max(1, len(shooting.h) // _INTERVALS_PER_CIRCLE)
+        joints, _ = loops.best(min(circles, MOST_CIRCLES))
     fine = _fine_times(shooting)
     return _along(shooting, base, fine, CubicSpline(times, joints)(fine), start, end)
 
