@@ -169,7 +169,7 @@ def test_more_circles_reach_what_one_circle_within_the_limits_cannot(polar):
     assert loops.best(1)[1] > 0.02 and loops.best(4)[1] < 0.01
 
 
-def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(polar, monkeypatch):
+def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(monkeypatch):
     allowed = []
 
     def best(loops, most):
@@ -177,9 +177,10 @@ def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(polar, mon
         return loops.path, 1.0
 
     monkeypatch.setattr(Loops, "best", best)
-    robot = polar.replace(inputs=motors(polar))
-    start = fflin.configuration(robot, {"slide": 0.6}), np.zeros(robot.nv)
-    end = fflin.configuration(robot, {"slide": 0.6}), np.zeros(robot.nv)
+    robot = fflin.load("planar_detumble")
+    robot = robot.replace(inputs=motors(robot))
+    start = robot.neutral(), np.zeros(robot.nv)
+    end = robot.neutral(), np.zeros(robot.nv)
     end[0][3:7] = [0.0, 0.0, np.sin(0.1), np.cos(0.1)]
     nx = 12 + 2 * robot.n
     for knots, most in ((20, 2), (150, MOST_CIRCLES)):
