@@ -6,6 +6,7 @@ from scipy.linalg import null_space
 
 import fflin
 from fflin import BaseForce, BaseTorque
+from fflin.analysis.controllability import _dominant
 from tests.support import exact
 from tests.support.mechanisms import mechanical, motors
 from tests.support.messages import says
@@ -354,3 +355,13 @@ def test_a_lost_vibration_is_lost_to_every_input(robots, share, dimension):
     period = 2.0 * np.pi / fflin.modes(lin).frequencies[-1]
     found = fflin.controllability(lin.discretize(share * period))
     assert found.dimension == dimension and found.stabilizable == (dimension == 30)
+
+
+def test_states_are_named_whatever_the_basis_of_their_combinations_is():
+    rng = np.random.default_rng(4)
+    vectors = np.linalg.qr(rng.normal(size=(8, 2)))[0].T
+    names = [f"x{k}" for k in range(8)]
+    expected = _dominant(vectors, names)
+    for angle in np.linspace(0.1, 3.0, 7):
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        assert _dominant(turn @ vectors, names) == expected

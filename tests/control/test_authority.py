@@ -53,7 +53,7 @@ def test_the_least_reach_is_that_of_linear_programs(m):
         cost = -np.eye(W.shape[1] + 1)[-1]
         return -linprog(cost, A_eq=equal, b_eq=np.zeros(m), bounds=bounds).fun
 
-    directions = rng.normal(size=(40, 3))
+    directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     found = np.array([reach(each) for each in directions])
     assert found.min() >= least * (1.0 - 1e-7)

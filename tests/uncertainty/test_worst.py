@@ -113,7 +113,7 @@ def springy(request):
     of, gain = fflin.uncertain(robot, SETS[request.param]), fflin.lqr(fflin.linearize(robot))
     scale = np.sqrt(gain.R.diagonal())
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    rows, figures = np.vstack((corners, of.draws(20, seed=0)[0])), []
+    rows, figures = np.vstack((corners, of.draws(40, seed=0)[0])), []
     for delta in rows:
         lin = fflin.linearize(of.at(of.values(delta)))
         F, poles = lin.A - lin.B @ gain.K, np.linalg.eigvals(lin.A - lin.B @ gain.K)
@@ -127,7 +127,7 @@ def springy(request):
 def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, figures = springy
-    least = of.worst(gain, samples=20)
+    least = of.worst(gain, samples=40)
     found = np.array((least.damping.value, least.margin.value, -least.gain.value))
     assert least.tried == len(figures) + 1
     # The gains are to five digits; the damping is by eigenvalues alone.
@@ -143,7 +143,7 @@ def test_more_samples_never_find_less(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, _ = springy
     assert (of.draws(40, seed=3)[0][:7] == of.draws(7, seed=3)[0]).all()
-    found = [of.worst(gain, samples=n, seed=3) for n in (1, 5, 20)]
+    found = [of.worst(gain, samples=n, seed=3) for n in (1, 5, 40)]
     for fewer, more in itertools.pairwise(found):
         assert more.damping.value <= fewer.damping.value
         assert more.margin.value <= fewer.margin.value
@@ -199,7 +199,7 @@ def test_the_worst_loop_of_one_parameter_is_at_its_end():
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
     of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
-    worst = of.worst(gain, samples=20)
+    worst = of.worst(gain, samples=40)
     damping, gains = [], []
     for density in np.linspace(0.5, 2.0, 61):
         other = fflin.linearize(of.at({"base.density": density}))
