@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from itertools import compress
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, Sample
+from fflin.control.policies import Feedback, Loop, OutputSensing, Sample
 from fflin.control.policy import Noise, OutputForm, Policy, Predictor, unstable_note
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
@@ -50,7 +49,7 @@ class System(NamedTuple):
 
 
 @dataclass(eq=False, repr=False)
-class LinearController(Feedback):
+class LinearController(OutputSensing, Feedback):
     r"""Output feedback ``u - u0 = system (y - y0)`` by any linear controller `system`.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
@@ -167,8 +166,6 @@ class LinearController(Feedback):
         self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
-    senses_outputs: ClassVar[bool] = True
-
     @property
     def notes(self) -> tuple[str, ...]:
         """Note on the momentum that wheels gain while they hold the robot at the point."""
@@ -180,11 +177,6 @@ class LinearController(Feedback):
         return self.dt
 
     @property
-    def measurement_noise(self) -> Noise | None:
-        """The function noise(t)."""
-        return self.noise
-
-    @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the outputs of the model."""
         return self.lin.output_names
@@ -194,12 +186,6 @@ class LinearController(Feedback):
         """Names of the states in the measured outputs of the controller."""
         acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
         return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
-
-    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
-        """Return the controller with other measurement noise."""
-        noisy = copy(self)
-        noisy.noise = error
-        return noisy
 
     def closed_loop(self) -> tuple[Array, float] | None:
         """Return the closed-loop matrix of model and controller, and dt [s]."""

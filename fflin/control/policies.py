@@ -1,8 +1,9 @@
 """Policies that compute the inputs: state feedback about a point, and allocation."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -66,6 +67,25 @@ class Feedback(Policy):
         S = selection(lin.state_names, state.names)
         near = S.T @ lin.x0
         return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
+
+
+class OutputSensing(Policy):
+    """Policy whose sensors are the outputs of the robot, with measurement noise."""
+
+    senses_outputs: ClassVar[bool] = True
+
+    noise: Noise | None
+
+    @property
+    def measurement_noise(self) -> Noise | None:
+        """The function noise(t)."""
+        return self.noise
+
+    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
+        """Return the law with other measurement noise."""
+        noisy = copy(self)
+        noisy.noise = error
+        return noisy
 
 
 @dataclass(eq=False)

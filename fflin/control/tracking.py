@@ -1,7 +1,6 @@
 """Trajectory tracking: feedback of the state or of the outputs along a trajectory."""
 
-from collections.abc import Callable, Mapping
-from copy import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import ClassVar
@@ -13,7 +12,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.kalman import kalman
-from fflin.control.policies import Allocation, Deviation, Feedback, Loop, Sample
+from fflin.control.policies import Allocation, Deviation, Feedback, Loop, OutputSensing, Sample
 from fflin.control.policy import (
     Command,
     Noise,
@@ -292,7 +291,7 @@ def poles_along(schedule: GainSchedule) -> Array:
 
 
 @dataclass(eq=False)
-class TrajectoryOutputFeedback(TrajectoryFeedback):
+class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
     r"""Feedback ``u = u*(t) - K(t) eh`` of the estimated error relative to a trajectory.
 
     At each sample, u is applied and y is measured. The filter then advances the estimate eh to the
@@ -330,8 +329,6 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
     filter: FilterSchedule
     noise: Noise | None = None
 
-    senses_outputs: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         super().__post_init__()
         expected = "a FilterSchedule, as fflin.tvkalman returns it"
@@ -367,20 +364,9 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise)
 
     @property
-    def measurement_noise(self) -> Noise | None:
-        """The function noise(t)."""
-        return self.noise
-
-    @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the outputs."""
         return self.filter.output_names
-
-    def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
-        """Return the law with other measurement noise."""
-        noisy = copy(self)
-        noisy.noise = error
-        return noisy
 
     def form(self, robot: Robot) -> OutputForm:
         """Return the matrices for each sample of the trajectory, and for the robot at rest."""
